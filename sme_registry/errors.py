@@ -119,9 +119,15 @@ class MissingDependencyError(SMEError, ImportError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`" Did you mean 'k'?"`, up to three similar names; empty if there are none. Ignores case."""
+    """`" Did you mean 'k'?"`, up to three similar names; empty if there are none. Ignores case.
+
+    Initials are similar: `lr` and `learning_rate`.
+    """
     by_fold = {candidate.casefold(): candidate for candidate in known}
-    close = difflib.get_close_matches(name.casefold(), by_fold, n=3, cutoff=0.6)
+    fold = name.casefold()
+    close = difflib.get_close_matches(fold, by_fold, n=3, cutoff=0.6) or [
+        each for each in by_fold if "".join(word[:1] for word in each.split("_")) == fold
+    ]
     if not close:
         return ""
-    return f" Did you mean {' or '.join(repr(by_fold[fold]) for fold in close)}?"
+    return f" Did you mean {' or '.join(repr(by_fold[each]) for each in close[:3])}?"

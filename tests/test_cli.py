@@ -31,8 +31,8 @@ from tests.commands import good, refused, sme
 SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
 KINDS = (EnvFile, StreamFile, SuiteFile, ProtocolFile, StudyFile)
 COMMANDS = [
-    *("list", "show", "new", "suite", "validate", "certify"),
-    *("evaluate", "train", "diagnose", "explore", "study", "demo"),
+    *("list", "show", "new", "check", "train"),
+    *("evaluate", "diagnose", "study", "data", "demo"),
 ]
 
 
@@ -53,24 +53,24 @@ def test_show_does_not_call_another_task_by_a_name_of_the_catalogue():
 
 def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path):
     good("new", "k2.json", "--k", "2", "--seed", "7")
-    printed = good(
-        "suite", "new", "mine.json", "-t", "Default", "-t", "k2.json", "--instances", "3"
-    ).stdout
+    printed = good("new", "mine.json", "-t", "Default", "-t", "k2.json", "--instances", "3").stdout
     file = SuiteFile.read(tmp_path / "mine.json")
     assert file.digest in printed
     assert file.suite.instances[3:] == tuple(SMESpec(k=2, seed=seed) for seed in (7, 8, 9))
-    good("suite", "new", "wider.json", "--suite", "mine.json", "-t", "Plane10")
+    good("new", "wider.json", "--suite", "mine.json", "-t", "Plane10")
     wider = SuiteFile.read(tmp_path / "wider.json").suite
     assert [member.name for member in wider.classes] == ["Default", "k2", "Plane10"]
-    good("suite", "new", "axis.json", "-t", "Default", "--sweep", "k=1,5")
+    good("new", "axis.json", "-t", "Default", "--sweep", "k=1,5")
     axis = SuiteFile.read(tmp_path / "axis.json").suite
     assert [spec.k for spec in axis.instances] == [1, 5]
     good("study", "new", "plan.json", "--suite", "wider.json", "-a", "reference:linear")
     assert StudyFile.read(tmp_path / "plan.json").plan.classes == wider.classes
     before = (tmp_path / "mine.json").read_bytes()
-    assert "--force" in refused("suite", "new", "mine.json", "-t", "Default")
-    assert "twice" in refused("suite", "new", "other.json", "-t", "Default", "-t", "Default")
-    assert "--task" in refused("suite", "new", "other.json")
+    assert "--force" in refused("new", "mine.json", "-t", "Default")
+    assert "twice" in refused("new", "other.json", "-t", "Default", "-t", "Default")
+    assert "--task" in refused("new", "other.json", "--sweep", "k=1,5")
+    assert "--task" in refused("new", "other.json", "--instances", "2")
+    assert "--k: is for a task" in refused("new", "other.json", "-t", "Default", "--k", "2")
     assert (tmp_path / "mine.json").read_bytes() == before
     assert not (tmp_path / "other.json").exists()
     assert "is the file of a suite, not of a task" in refused("train", "mine.json")
@@ -94,7 +94,7 @@ def test_train_takes_a_task_or_a_suite_and_refuses_options_of_the_other():
     assert "TASK" in refused("train", "Default", "--suite", "smoke")
     assert "--num-envs" in refused("train", "--suite", "smoke", "--num-envs", "2")
     assert "--seeds" in refused("train", "Default", "--seeds", "2")
-    assert "sme suite new" in refused("train", "--suite", "smoke", "--set", "k=2")
+    assert "sme new" in refused("train", "--suite", "smoke", "--set", "k=2")
     assert "seeds" in refused("train", "--suite", "smoke", "--seeds", "0")
     assert "'nothing'" in refused("train", "--suite", "nothing")
     assert not list(Path().iterdir())
@@ -128,6 +128,48 @@ def test_a_usage_error_is_one_line_that_points_to_the_help(arguments):
     message = refused(*arguments)
     assert len(message.splitlines()) == 1
     assert "--help`." in message
+
+
+@pytest.mark.parametrize(
+    ("command", "instead"),
+    [
+        ("suite new mine.json -t Default", "sme new mine.json"),
+        ("validate mine.json", "sme check"),
+        ("certify Default", "sme check"),
+        ("dataset make Default", "sme data make"),
+        ("offline train x -a bc", "sme train --data"),
+    ],
+)
+def test_a_command_of_before_says_what_replaces_it(command, instead):
+    message = refused(*command.split())
+    assert instead in message
+    assert len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("evaluate x.pt Default", "is a PyTorch file, which lacks the network's code"),
+        ("train x.onnx", "To evaluate it: sme evaluate x.onnx TASK"),
+        ("train --suite Default", "is the name of a task, not of a suite. To train on it alone"),
+        ("train smoke", "is the name of a suite, not of a task. To train on all of its tasks: sme"),
+        ("train Default --lr 0.1", "--set lr=VALUE"),
+        ("train Default --set lr=0.1", "Did you mean 'learning_rate'"),
+        ("train Default --step 5", "Did you mean '--steps'"),
+        ("train Default -n 1e5 --seed -1", "seed=-1"),
+        ("study new a.json -t Default --sweep k=1:100 -a PPO", "k=1:100: a range is not expanded"),
+        ("show :x:.json", ":x:.json: cannot be read"),
+        ("show newer.json", "a newer version wrote it. Upgrade"),
+        ("train report.json", "is a report, or the record of a run, on the task 'sha256:0"),
+    ],
+)
+def test_a_beginners_mistake_is_named_with_its_remedy(command, message, tmp_path):
+    good("new", "newer.json")
+    text = (tmp_path / "newer.json").read_text().replace('_version": 1', '_version": 9')
+    (tmp_path / "newer.json").write_text(text)
+    report = {"spec": {}, "spec_digest": "sha256:0", "regions": []}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert message in refused(*command.split())
 
 
 class TestList:
@@ -196,7 +238,7 @@ class TestShow:
         assert "limits" not in text
         assert re.search(r"^safety +None$", text, re.M)
         good("new", "c.json", "--safety", '{"tightness": 0.2}')
-        good("suite", "new", "s.json", "-t", "c.json", "--sweep", "safety.tightness=0.1,0.4")
+        good("new", "s.json", "-t", "c.json", "--sweep", "safety.tightness=0.1,0.4")
         text = good("show", "s.json").stdout
         assert re.search(r"safety-tightness-0_4 +safety\.tightness=0\.4 ", text)
 
@@ -241,8 +283,8 @@ class TestShow:
         shown = json.loads(good("show", stream.digest[:19], "--json").stdout)
         assert shown == {"stream": stream.to_dict(), "digest": stream.digest}
         assert stream.digest in good("show", stream.digest[:19]).stdout
-        certificates = json.loads(good("certify", stream.digest[:19], "--json").stdout)
-        assert len(certificates) == len(stream.phases)
+        (checked,) = json.loads(good("check", stream.digest[:19], "--json").stdout)
+        assert len(checked["certificates"]) == len(stream.phases)
 
     def test_a_suite_lists_its_instances_by_names_to_train_by(self, tmp_path):
         file = catalogue.find(SuiteFile, "smoke")
@@ -307,7 +349,7 @@ class TestNew:
         given = {name.strip("-").replace("-", "_"): value for name, value in fields.items()}
         assert file.spec == SMESpec(**given)  # type: ignore[arg-type]
         assert (file.name, file.description, file.tags) == ("Mine", "A task.", ("a",))
-        assert file.digest in good("validate", "mine.json").stdout
+        assert file.digest in good("check", "mine.json", "--files-only").stdout
         good("new", "plain.json")
         assert load(tmp_path / "plain.json") == SMESpec()
 
@@ -395,7 +437,9 @@ class TestNew:
 
 class TestValidate:
     def test_each_kind_is_told_and_folders_are_searched(self):
-        results = json.loads(good("validate", catalogue.spec_folder(), "--json").stdout)
+        results = json.loads(
+            good("check", catalogue.spec_folder(), "--files-only", "--json").stdout
+        )
         assert {result["kind"] for result in results} == {
             "env",
             "stream",
@@ -424,9 +468,9 @@ class TestValidate:
         (tmp_path / "cut.json").write_text('{"spec": {')
         names = [*broken, "nan.json", "missing.json", "cut.json", "good.json"]
 
-        result = sme("validate", *names, "--json")
+        result = sme("check", *names, "--files-only", "--json")
         assert result.exit_code == 2
-        results = {entry["path"]: entry for entry in json.loads(result.stdout)}
+        results = {entry["name"]: entry for entry in json.loads(result.stdout)}
         assert list(results) == names
         assert [name for name in names if results[name]["valid"]] == ["good.json"]
         expected = {
@@ -443,32 +487,32 @@ class TestValidate:
         plain = catalogue.find(SuiteFile, "smoke").to_dict()
         plain["suite"]["classes"][0]["seeds"] = [77]
         (tmp_path / "suite.json").write_text(json.dumps(plain))
-        assert "digest=" in sme("validate", "suite.json").stdout
-        refused("validate", "suite.json")
+        assert "digest=" in sme("check", "suite.json").stdout
+        refused("check", "suite.json")
 
     def test_an_empty_folder_is_refused(self, tmp_path):
         (tmp_path / "empty").mkdir()
-        assert "no .json" in refused("validate", "empty")
+        assert "no .json" in refused("check", "empty")
 
 
 class TestCertify:
     def test_a_sound_task_passes_with_its_numbers(self):
-        (made,) = json.loads(good("certify", "Default", "--json").stdout)
+        (made,) = json.loads(good("check", "Default", "--json").stdout)[0]["certificates"]
         assert made == {"task": "Default", **certify(load("Default")).to_dict()}
-        text = good("certify", "Default").stdout
+        text = good("check", "Default").stdout
         assert all(check.name in text for check in certify(load("Default")).checks)
 
     def test_a_trivial_task_exits_with_one(self):
         good("new", "trivial.json", "--state-dim", "2", "--action-dim", "2", "--complexity", "3")
-        result = sme("certify", "trivial.json")
+        result = sme("check", "trivial.json")
         assert result.exit_code == 1
         assert re.search(r"^refused +trivial.json +constant_policy_similarity", result.stdout, re.M)
-        assert sme("certify", "Default", "trivial.json").exit_code == 1
+        assert sme("check", "Default", "trivial.json").exit_code == 1
 
     def test_a_trivial_agent_among_others_is_found_and_named(self):
         team = '{"agents": [{"action_dim": 4, "observes": [0]}, {"action_dim": 4}]}'
         good("new", "t.json", "--action-dim", "8", "--seed", "1", "--team", team)
-        (made,) = json.loads(good("certify", "t.json", "--json").stdout)
+        (made,) = json.loads(good("check", "t.json", "--json").stdout)[0]["certificates"]
         checks = {check["name"]: check for check in made["checks"]}
         of_agent = checks.pop("agent_constant_policy_similarity")
         assert of_agent["outcome"] == "warning"
@@ -477,19 +521,18 @@ class TestCertify:
         assert {check["outcome"] for check in checks.values()} == {"passed", "reported"}
 
     def test_a_suite_is_certified_task_by_task(self):
-        text = good("certify", "smoke").stdout
-        assert len(text.splitlines()) == len(catalogue.find(SuiteFile, "smoke").suite.instances)
+        text = good("check", "smoke").stdout
+        assert len(text.splitlines()) == 1 + len(catalogue.find(SuiteFile, "smoke").suite.instances)
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
             (("Defalt",), "Did you mean"),
-            (("paper-v1",), "is a protocol"),
             (("Default", "--seed", "-1"), "seed=-1"),
         ],
     )
     def test_bad_input(self, arguments, message):
-        assert message in refused("certify", *arguments)
+        assert message in refused("check", *arguments)
 
 
 QUICK = ("--protocol", "quick-v1")
@@ -521,7 +564,11 @@ class TestEvaluate:
             expected = [region["similarity"] for region in part["references"][reference]]
             assert similarity == pytest.approx(expected, abs=close)
         if policy == "constant":
-            assert "agent_3" in good("evaluate", policy, "TeamBlind4", *QUICK).stdout
+            shown = ("evaluate", policy, "TeamBlind4", *QUICK)
+            assert "agent_3" in good(*shown, "--all").stdout
+            lines = [line for line in good(*shown).stdout.splitlines() if line.startswith("  ")]
+            names = [line.split("  ")[1] for line in lines if not line.startswith("    ")]
+            assert names == 2 * ["constant", "linear", "random", "optimal"]
 
     def test_a_function_is_the_policy_that_a_team_shares(self, tmp_path):
         (tmp_path / "shared_for_the_test.py").write_text(
@@ -559,6 +606,14 @@ class TestEvaluate:
         assert report["regions"][0]["similarity"] == pytest.approx(half, abs=1e-12)
         lower = json.loads(good(*arguments).stdout)["regions"][0]["similarity"]
         assert lower < half - 0.1
+        (tmp_path / "tanh_for_the_test.py").write_text(
+            "import numpy as np\n"
+            "def act(observations):\n    return np.full((len(observations), 4), -0.5)\n"
+        )
+        note = "100% of the actions in WD are outside [0, 1] and were clipped."
+        command = ("evaluate", "tanh_for_the_test:act", "Default", *QUICK)
+        assert note in good(*command).stderr
+        assert note not in good(*command, "--action-range", "symmetric").stderr
 
     def test_overrides_evaluate_the_derived_task(self):
         text = good(
@@ -664,6 +719,7 @@ class TestTrain:
         assert printed["evaluation"] == json.loads((folder / "evaluation.json").read_text())
         assert "training TD3: 120 of 120 steps" in result.stderr
         assert "Warning" not in result.stderr
+        assert "note:" not in result.stderr
         assert "finished run" in refused(*SHORT)
         again = json.loads(
             good("evaluate", folder / "model.zip", "Plane1", *QUICK, "--json").stdout
@@ -763,7 +819,12 @@ class TestTrain:
         run = json.loads((tmp_path / "run/run.json").read_text())
         assert run["status"] == "running"
         steps = str(run["steps_done"] + 30)
-        printed = json.loads(good(*command, "-n", steps, "--resume", "--json").stdout)
+        log = tmp_path / "run/episodes.csv"
+        log.write_text("\n".join(log.read_text().splitlines()[:-2]))
+        result = good(*command, "-n", steps, "--resume", "--json")
+        episodes = run["episodes"]
+        assert f"of the {episodes} episodes before the checkpoint are missing" in result.stderr
+        printed = json.loads(result.stdout)
         assert printed["run"]["sessions"] == 2
         assert printed["run"]["steps_done"] == int(steps)
 
@@ -830,7 +891,7 @@ def test_a_reader_that_leaves_early_is_no_error(arguments):
 @pytest.mark.parametrize(
     "command",
     [
-        ("dataset", "make", "Switch5"),
+        ("data", "make", "Switch5"),
         ("diagnose", "optimal", "--task", "Switch5"),
         ("new", "mine.json", "--from", "Switch5"),
     ],

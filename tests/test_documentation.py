@@ -95,7 +95,7 @@ def test_a_tutorial_works_from_top_to_bottom(name, packages, shorter, tmp_path, 
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "tutorials" / f"{name}.md").read_text()
-    run("sme", "suite new two.json -t Default -t Plane1 --instances 1")
+    run("sme", "new two.json -t Default -t Plane1 --instances 1")
     for full, short in shorter.items():
         assert full in page
         page = page.replace(full, short)

@@ -10,7 +10,7 @@
 `ppo` and `sac` spend the budget of each instance of a ticket. If one is stopped or killed, start it
 again with the same arguments: it goes on with the last model that it saved and the steps that are
 left. `table` answers with the mean of the eight nearest of the best actions of a data set.
-`sme offline sealed` trains BC and IQL.
+`sme train --data` trains BC and IQL.
 """
 
 from __future__ import annotations

@@ -209,7 +209,7 @@ def site(
         bool,
         typer.Option(
             "--explorers",
-            help="Also an explorer (`sme explore`) of each policy, in about a second each.",
+            help="Also an explorer of each policy (`sme diagnose --explore`), each in a second.",
         ),
     ] = False,
 ) -> None:

@@ -1,6 +1,6 @@
 """The command `sme`; the module of a command is imported when it is called.
 
-Exit codes: 0 success; 1 a task refused by `certify`, or failed cells of a study; 2 invalid input;
+Exit codes: 0 success; 1 a task refused by `check`, or failed cells of a study; 2 invalid input;
 130 interrupted.
 """
 
@@ -15,21 +15,22 @@ class _Commands(CommandGroup):
     modules: ClassVar = {
         "list": (f"{__name__}.show", "List tasks, streams, suites, protocols and studies."),
         "show": (f"{__name__}.show", "Show one of them: its fields, its digest and what follows."),
-        "new": (f"{__name__}.task", "Write the file of a task of your own."),
-        "suite": (f"{__name__}.task", "Write a suite of your own: classes of tasks."),
-        "validate": (
-            f"{__name__}.task",
-            "Check files of tasks, suites, protocols and studies.",
-        ),
-        "certify": (f"{__name__}.task", "Draw a task and check that it is sound."),
+        "new": (f"{__name__}.task", "Write the file of a task or a suite of your own."),
+        "check": (f"{__name__}.task", "Check files, and that the drawn tasks are sound."),
         "train": (f"{__name__}.train", "Train an agent with its exact regret, and evaluate it."),
         "evaluate": (f"{__name__}.evaluate", "Evaluate a policy in and out of distribution."),
         "diagnose": (f"{__name__}.evaluate", "Show where a policy's regret occurs, and why."),
-        "explore": (f"{__name__}.evaluate", "Write a page that shows the regret in any state."),
+        "explore": (f"{__name__}.evaluate", ""),
         "study": (f"{__name__}.study", "Compare algorithms on classes of tasks, over seeds."),
-        "dataset": (f"{__name__}.data", "Make data sets for offline RL, of a chosen quality."),
-        "offline": (f"{__name__}.data", "Train on a data set, never in the environment."),
+        "data": (f"{__name__}.data", "Make data sets for offline RL, of a chosen quality."),
         "demo": (f"{__name__}.train", "Train, evaluate and draw, in less than a minute."),
+    }
+    replaced: ClassVar = {
+        "suite": "is `sme new` now: sme new mine.json -t Default --instances 5.",
+        "validate": "is `sme check` now, which also checks the draw: sme check mine.json.",
+        "certify": "is `sme check` now, which also checks the file: sme check mine.json.",
+        "dataset": "is `sme data` now: sme data make Default --nu 0.5.",
+        "offline": "is `sme train --data` now: sme train --data DATASET -a iql.",
     }
 
 
@@ -39,18 +40,14 @@ app = application(
 
     To start:
 
-      sme list
       sme show Default
       sme demo
 
-    Your own task:
+    Your own task, and an agent on it; with --agents jax it is faster:
 
       sme new mine.json --complexity 10 --seed 3
-
-    An agent of Stable-Baselines3, and the same in JAX, which is faster:
-
+      sme check mine.json
       sme train mine.json -a PPO
-      sme train mine.json -a PPO --agents jax
     """,
     _Commands,
 )

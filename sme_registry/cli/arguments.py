@@ -140,9 +140,9 @@ def changes(texts: list[str] | None) -> dict[str, Any]:
     return {name: json_or_text(value) for name, value in values.items()}
 
 
-def changed(
-    document: SMESpec | StreamSpec, name: str, fields: dict[str, Any]
-) -> SMESpec | StreamSpec:
+def load_changed(name: str, fields: dict[str, Any]) -> SMESpec | StreamSpec:
+    """The task of a name with other values of these fields; or the stream, which takes none."""
+    document = sme_registry.load(name)
     if isinstance(document, SMESpec):
         return document.derive(**fields)
     for field in fields:
@@ -165,39 +165,34 @@ def check_document_path(path: Path, *, force: bool) -> None:
     check_new(path, force=force)
 
 
-def with_options(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the fields of a dataclass as options; it receives them as `options`."""
-
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        hints = typing.get_type_hints(command, include_extras=True)
-        types = typing.get_type_hints(options, include_extras=True)
-        fields = [
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=field.default,
-                annotation=types[field.name],
-            )
-            for field in dataclasses.fields(options)
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the fields of its parameters that are dataclasses as options."""
+    hints = typing.get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {
+        name: kind for name, kind in hints.items() if dataclasses.is_dataclass(kind)
+    }
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        kind = inspect.Parameter.KEYWORD_ONLY
+        if name not in groups:
+            parameters.append(parameter.replace(annotation=hints[name], kind=kind))
+            continue
+        types = typing.get_type_hints(groups[name], include_extras=True)
+        parameters += [
+            inspect.Parameter(field.name, kind, default=field.default, annotation=types[field.name])
+            for field in dataclasses.fields(groups[name])
         ]
-        parameters: list[inspect.Parameter] = []
-        for name, parameter in inspect.signature(command).parameters.items():
-            if name == "options":
-                parameters += fields
-            else:
-                kind = inspect.Parameter.KEYWORD_ONLY
-                parameters.append(parameter.replace(annotation=hints[name], kind=kind))
 
-        @functools.wraps(command)
-        def with_fields(**values: Any) -> None:
-            chosen = {field.name: values.pop(field.name) for field in fields}
-            command(options=options(**chosen), **values)
+    @functools.wraps(command)
+    def with_fields(**values: Any) -> None:
+        for name, group in groups.items():
+            chosen = {field.name: values.pop(field.name) for field in dataclasses.fields(group)}
+            values[name] = group(**chosen)
+        command(**values)
 
-        with_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        with_fields.__annotations__ = {p.name: p.annotation for p in parameters}
-        return with_fields
-
-    return decorate
+    with_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    with_fields.__annotations__ = {p.name: p.annotation for p in parameters}
+    return with_fields
 
 
 def only_with(context: typer.Context, names: Iterable[str], reason: str) -> None:
@@ -231,18 +226,23 @@ def print_training(
     print_line(f"All files are in {escape(str(folder))}{os.sep}")
 
 
-def print_checks(results: list[dict[str, Any]], what: str, *, json: bool) -> None:
-    """Print which of several things are valid, and why the others are not: exit code 2."""
-    if json:
-        print_json(results)
-    for result in results if not json else ():
-        about = " ".join(str(result[key]) for key in result if key not in ("valid", "error"))
+def print_checks(results: Iterable[dict[str, Any]], what: str, *, json: bool) -> None:
+    """Print which of several things are valid as they come, and why others are not: exit code 2."""
+    checked = []
+    for result in results:
+        checked.append(result)
+        if json:
+            continue
+        shown = (result.get(key) for key in ("name", "kind", "digest"))
+        about = " ".join(str(value) for value in shown if value is not None)
         verdict = "[green]valid[/]  " if result["valid"] else "[red]invalid[/]"
         print_line(f"{verdict}  {escape(about if result['valid'] else result['error'])}")
-    invalid = sum(not result["valid"] for result in results)
+    if json:
+        print_json(checked)
+    invalid = sum(not result["valid"] for result in checked)
     if invalid:
         raise OptionError(
-            f"{invalid} of {len(results)} {what} {'is' if invalid == 1 else 'are'} invalid."
+            f"{invalid} of {len(checked)} {what} {'is' if invalid == 1 else 'are'} invalid."
         )
 
 

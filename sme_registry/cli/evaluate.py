@@ -1,7 +1,8 @@
-"""`sme evaluate`, `diagnose`, `explore`: how good a policy is, where its regret is, and why."""
+"""`sme evaluate` and `diagnose`: how good a policy is, where its regret is, and why."""
 
 from __future__ import annotations
 
+import functools
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +21,8 @@ from sme_registry.cli.arguments import (
     SpecChanges,
     TaskName,
     can_draw,
-    changed,
     changes,
+    load_changed,
     only_with,
     print_tables,
     print_written,
@@ -34,7 +35,8 @@ from sme_registry.evaluation import EvaluationReport, Policy, StreamReport
 from sme_registry.evaluation.policies import TeamPolicy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import check_new, integer_in, write_atomically
-from sme_registry.io.terminal import Progress, err, out, print_json
+from sme_registry.io.terminal import Progress, err, print_json, print_note
+from sme_registry.io.terminal import out as stdout
 from sme_registry.plots.maps import STREAM
 from sme_registry.plots.reports import write_evaluation, write_stream
 from sme_registry.spec import (
@@ -46,6 +48,7 @@ from sme_registry.spec import (
 )
 from sme_registry.task import load
 
+_CLIPPED = 0.2  # the share of actions above which their range is doubted
 _EVALUATION = "evaluation.json"
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
 _POLICY_FILES = (".zip", ".onnx", ".npz")
@@ -74,6 +77,11 @@ def evaluate(
     out_folder: Out = None,
     action_range: ActionRange = None,
     set_: SpecChanges = None,
+    all_: Annotated[
+        bool, typer.Option("--all", help="All numbers, of all reference policies.")
+    ] = False,
+    force: Force = False,
+    json: Json = False,
     algorithm: Annotated[
         str | None,
         typer.Option(
@@ -92,21 +100,13 @@ def evaluate(
             help="Of a stream: an agent trained on one phase alone. Repeat it for each phase.",
         ),
     ] = None,
-    force: Force = False,
-    json: Json = False,
 ) -> None:
     """Evaluate a policy in and out of distribution, compared with reference policies.
 
-    A function takes observations `[B, S + 2]`, with m distractors `[B, S + m + 2]`, and returns
-    actions `[B, A]`, in [0, 1] unless --action-range is symmetric; so does an .onnx network. A .zip
-    of Stable-Baselines3 can run code when it is loaded: use only files whose author you trust.
-
-    For a team, give a folder with the policy of each agent, such as agent_0.zip, or the one policy
-    that all agents share. That one is called for each agent with `[B, S + 2 + n]`: the state with
-    unobserved channels set to 0, t/T, the agent's r_cum/k, and its one-hot index.
-
-    On a stream, give the policy at the end of each visit, or one policy for the whole life, which
-    learns nothing: its expected dynamic regret is reported as well.
+    A function takes observations `[B, S + 2]` and returns actions `[B, A]`, in [0, 1] unless
+    --action-range is symmetric; so does an .onnx network. A .zip can run code when it is loaded:
+    use only files whose author you trust. For a team, give the one policy that all agents share, or
+    a folder with one for each, such as agent_0.zip; on a stream, one for the end of each visit.
 
     Examples:
 
@@ -114,11 +114,10 @@ def evaluate(
       sme evaluate runs/demo/model.zip Default --out runs/demo-again
       sme evaluate actor.onnx Default --action-range symmetric
       sme evaluate mypolicy:act Default --protocol quick-v1 --json
-      sme evaluate runs/Team4-PPO-seed0/model.zip Team4
       sme evaluate runs/Team4-independent-PPO-seed0/model Team4
-      sme evaluate runs/life/snapshots/visit-*.zip Switch5 --initial runs/life/snapshots/initial.zip
+      sme evaluate runs/life/snapshots/visit-*.zip Switch5
     """
-    document = changed(load(task), task, changes(set_))
+    document = load_changed(task, changes(set_))
     resolved = evaluation.resolve_protocol(protocol)
     is_stream = isinstance(document, StreamSpec)
     target = None if out_folder is None else out_folder / (STREAM if is_stream else _EVALUATION)
@@ -139,6 +138,12 @@ def evaluate(
         policy = evaluation.as_policy(policies[0], document, **options)
         with _progress(resolved) as progress:
             report = evaluation.evaluate(policy, document, resolved, progress=progress.update_of)
+        clipped = report.regions[0].clipped_share
+        if action_range is None and report.action_range == "unit" and clipped > _CLIPPED:
+            print_note(
+                f"{clipped:.0%} of the actions in WD are outside [0, 1] and were clipped. If the "
+                "policy's actions are in [−1, 1], add --action-range symmetric."
+            )
     files = []
     if target is not None:
         files.append(report.write(target))
@@ -149,7 +154,7 @@ def evaluate(
     if json:
         print_json(report.to_dict())
     else:
-        print_tables(report.tables())
+        print_tables(report.tables(details=all_))
     print_written(files)
 
 
@@ -255,17 +260,35 @@ class SubjectOptions:
         return replace(self, cell=None, log=None).subject(against)
 
 
+_NOT_OF_EXPLORE = ("against", "probe_capacity", "states", "all_", "json")
+_OF_EXPLORE = ("channels", "open_")
+
+
 @app.command()
-@with_options(SubjectOptions)
+@with_options
 def diagnose(
+    context: typer.Context,
     run: Annotated[
         str,
         typer.Argument(
             metavar="RUN",
-            help="A folder of `sme train`; with --cell, of a study; with --task, any policy.",
+            help="A folder of `sme train`; with --cell, of a study; with --task, any policy; with "
+            "--explore also a task.",
+            autocompletion=catalogue.completion(EnvFile),
         ),
     ],
-    options: SubjectOptions,
+    explore: Annotated[
+        bool,
+        typer.Option("--explore", help="Instead write a page that shows the regret in any state."),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Output folder; with --explore, the .html file."),
+    ] = None,
+    all_: Annotated[
+        bool,
+        typer.Option("--all", help="Also what was ruled out, with its evidence, and all numbers."),
+    ] = False,
     against: Annotated[
         str | None,
         typer.Option(
@@ -281,45 +304,55 @@ def diagnose(
             help="Fit a network of the same layers to the optimal actions; takes under a minute.",
         ),
     ] = False,
-    out_folder: Out = None,
+    *,
+    subject: SubjectOptions,
+    force: Force = False,
+    json: Json = False,
     states: Annotated[int, typer.Option(help="Uniform states to evaluate in.")] = 8192,
     episodes: Annotated[int, typer.Option(help="Episodes to evaluate.")] = 64,
     seed: Annotated[int, typer.Option(help="Seed of these states and start states.")] = 0,
-    all_: Annotated[
-        bool,
-        typer.Option("--all", help="Also what was ruled out, with its evidence, and all numbers."),
+    channels: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="I,J",
+            help="With --explore: two channels over which to sample a policy whose network is "
+            "unknown; default 1,2. Repeatable.",
+        ),
+    ] = None,
+    open_: Annotated[
+        bool, typer.Option("--open", help="With --explore: open the page in a browser.")
     ] = False,
-    force: Force = False,
-    json: Json = False,
 ) -> None:
-    """Show where a policy's regret occurs and what most likely causes it. Takes seconds.
+    """Show where a policy's regret occurs and what most likely causes it.
 
     What was found comes first, the largest share of the error at the top; --all shows the rest.
-    The answer is "cannot tell" if the evidence does not separate causes: exploration, credit
-    assignment (k), sparse reward (r_min), capacity (L), dimension, survival (D), budget, and on
-    such tasks limits and distractors. --against or --probe-capacity then often help.
+    Where the evidence does not separate causes, --against or --probe-capacity often help. With
+    --out, it also writes diagnosis.json, diagnosis.md and figures.
 
-    Of a team, it shows who is to blame for the team's regret. Of a life in a stream, it shows which
-    phases were costly, forgotten or never learnt, and whether plasticity was lost.
-
-    With --out, it also writes diagnosis.json, diagnosis.md and figures. Loading a model's .zip can
-    run code: use only files whose author you trust.
+    --explore writes one HTML file, which carries the networks and needs no connection. Loading a
+    model's .zip can run code: use only files whose author you trust.
 
     Examples:
 
       sme diagnose runs/Default-TD3-seed0 --out runs/Default-TD3-seed0/diagnosis
       sme diagnose runs/k10 --against runs/k1 --probe-capacity
-      sme diagnose mypolicy:act --task Complexity10
       sme diagnose actor.onnx --task Default --log runs/mine/episodes.csv
       sme diagnose runs/smoke --cell 3f2a91c4
-      sme diagnose runs/Team4-PPO-seed0 --out runs/Team4-PPO-seed0/diagnosis
-      sme diagnose runs/Switch5-PPO-seed0 --out runs/Switch5-PPO-seed0/diagnosis
+      sme diagnose runs/demo --explore --open
+      sme diagnose Complexity10 --explore
     """
-    if out_folder is not None:
-        check_new(out_folder / _JSON, force=force)
+    if explore:
+        only_with(context, _NOT_OF_EXPLORE, "is not for --explore. Leave one of them out")
+        page = _write_page(run, subject, out, channels, episodes, seed, force=force)
+        if open_:
+            typer.launch(page.absolute().as_uri())
+        return
+    only_with(context, _OF_EXPLORE, "is for --explore. Add --explore, or leave it out")
+    if out is not None:
+        check_new(out / _JSON, force=force)
     result = diagnosis.diagnose(
-        options.subject(run),
-        against=None if against is None else options.other(run, against),
+        subject.subject(run),
+        against=None if against is None else subject.other(run, against),
         probe_capacity=probe_capacity,
         states=states,
         episodes=episodes,
@@ -330,71 +363,34 @@ def diagnose(
         print_json(result.to_dict())
     else:
         for part in result.terminal(details=all_):
-            out().print(part)
-    if out_folder is None:
+            stdout().print(part)
+    if out is None:
         return
-    figures = draw(result, out_folder) if can_draw() else ()
+    figures = draw(result, out) if can_draw() else ()
     names = [path.name for path in figures if path.suffix == ".png"]
     text = result.markdown(names, details=all_)
     # The data last, so that the other files exist once it does.
-    written = write_atomically(out_folder / _PAGE, text)
-    data = result.write(out_folder / _JSON)
+    written = write_atomically(out / _PAGE, text)
+    data = result.write(out / _JSON)
     print_written([*figures, written, data])
 
 
-@app.command()
-@with_options(SubjectOptions)
-def explore(
-    what: Annotated[
-        str,
-        typer.Argument(
-            metavar="WHAT",
-            help="A folder of `sme train`; a task, by name, path or digest; with --task, any "
-            "policy; with --cell, a study.",
-            autocompletion=catalogue.completion(EnvFile),
-        ),
-    ],
+@app.command("explore", hidden=True)
+@functools.wraps(diagnose)
+def explore(**options: Any) -> None:
+    diagnose(**options | {"explore": True})
+
+
+def _write_page(
+    what: str,
     options: SubjectOptions,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="The .html file. Default explorer.html in a run's folder, else "
-            "NAME-explorer.html here.",
-        ),
-    ] = None,
-    channels: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="I,J",
-            help="Two channels over which to sample a policy whose network is unknown; default "
-            "1,2. Repeatable.",
-        ),
-    ] = None,
-    episodes: Annotated[int, typer.Option(help="Episodes for the regret over time.")] = 64,
-    seed: Annotated[int, typer.Option(help="Seed of their start states.")] = 0,
-    open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
-    force: Force = False,
-) -> None:
-    """Write one HTML file that shows regret in any state, in and beyond the training cube.
-
-    The file carries the networks and computes them in the browser: it needs no connection and no
-    installation. Networks are known of Stable-Baselines3's models with MlpPolicy, of our agents in
-    JAX, of offline policies (.npz), and of PyTorch modules and ONNX files of feed-forward layers.
-    Any other policy is sampled over the channels of --channels, and the other sliders are off.
-
-    Of a task alone, the page shows the optimal policy, and the regret of a linear and of a constant
-    policy. Loading a model's .zip can run code: use only files whose author you trust.
-
-    Examples:
-
-      sme explore runs/demo --open
-      sme explore Complexity10
-      sme explore actor.onnx --task Default
-      sme explore mypolicy:act --task Complexity10 --channels 1,2 --channels 3,7
-      sme explore runs/smoke --cell 3f2a91c4 --out cell.html
-    """
+    out: Path | None,
+    channels: list[str] | None,
+    episodes: int,
+    seed: int,
+    *,
+    force: bool,
+) -> Path:
     integer_in("--episodes", episodes, 1, 10_000)
     pairs = [_channels(text) for text in channels or ()]
     target = _target(what, options, out, force=force)
@@ -409,8 +405,7 @@ def explore(
         seed=seed,
     )
     print_written([written])
-    if open_:
-        typer.launch(written.absolute().as_uri())
+    return written
 
 
 def _target(what: str, options: SubjectOptions, out: Path | None, *, force: bool) -> Path:

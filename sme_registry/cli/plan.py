@@ -30,6 +30,7 @@ from sme_registry.io import read_json
 from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
 from sme_registry.io.terminal import (
+    count,
     duration,
     duration_range,
     err,
@@ -99,11 +100,12 @@ class Budgets:
         texts = [text if "=" in text else f"{_EVERY}={text}" for text in self.steps or ()]
         steps: dict[str, int] = {}
         for name, number in assignments("--steps", texts, "PPO=100000").items():
-            if not number.replace("_", "").isdecimal():
+            try:
+                steps[name] = count(number)
+            except typer.BadParameter:
                 raise OptionError(
-                    f"--steps {number!r}: must be N or ALGORITHM=N, such as --steps PPO=100000."
-                )
-            steps[name] = int(number)
+                    f"--steps {number!r}: must be N or ALGORITHM=N, such as --steps PPO=1e5."
+                ) from None
         every = steps.pop(_EVERY, None)
         counts = {"seeds": self.seeds, "evaluations": self.evaluations}
         file = scaled(file, steps=every, steps_of=steps, **counts)
@@ -218,7 +220,7 @@ Jobs = Annotated[
 ]
 
 
-@with_options(Budgets)
+@with_options
 def plan(
     options: Budgets,
     plan: PlanName,
@@ -343,7 +345,7 @@ def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
 _ALLOWED_WITH_FROM = ("path", "name", "description", "source", "force")
 
 
-@with_options(PlanOptions)
+@with_options
 def new(
     context: typer.Context,
     path: NewFile,
@@ -363,21 +365,17 @@ def new(
 ) -> None:
     """Write a plan: which algorithms run on which tasks, how often, and for how long.
 
-    A plan is a file that a colleague can run. Reference policies learn nothing and take no steps.
-    In a stream an algorithm lives once, for the steps of the stream, and a fresh agent trains on
-    each phase alone.
-    Settings without an option are edited in the file. Editing changes the digest, so the file is
-    rejected until --from rewrites it.
+    A plan is a file that a colleague can run. Settings without an option are edited in the file.
+    Editing changes the digest, so the file is rejected until --from rewrites it. In a stream an
+    algorithm lives once, and a fresh agent trains on each phase alone.
 
     Examples:
 
-      sme study new mine.json --suite smoke -a PPO -a TD3 -a reference:linear --seeds 5 -n 20000
-      sme study new deep.json -t Default -t Complexity10 -a TQC=sb3_contrib:TQC -n 10000
-      sme study new ranges.json -t Default -a PPO --action-range symmetric --action-range unit
-      sme study new intervals.json -t Default --sweep k=1,2,5,10 -a PPO --seeds 5 -n 20000
-      sme study new two.json --suite smoke -a PPO -a slow=PPO --set slow.learning_rate=0.0001
-      sme study new teams.json --suite teams -a PPO -a independent:PPO --seeds 3 -n 20000
-      sme study new lives.json -t Switch5 -t Related5 -a PPO --seeds 3 --instances 3
+      sme study new mine.json --suite smoke -a PPO -a TD3 -a reference:linear
+      sme study new deep.json -t Default -t Complexity10 -a TQC=sb3_contrib:TQC
+      sme study new intervals.json -t Default --sweep k=1,2,5,10 -a PPO --seeds 5
+      sme study new two.json --suite smoke -a slow=PPO --set slow.n_steps=64
+      sme study new lives.json -t Switch5 -t Related5 -a PPO --instances 3
       sme study new wider.json --from edited.json
     """
     check_document_path(path, force=force)

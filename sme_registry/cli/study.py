@@ -64,7 +64,7 @@ study = typer.Typer(
 )
 
 
-@with_options(Budgets)
+@with_options
 def run(
     plan: PlanName,
     folder: NewFolder,
@@ -101,20 +101,15 @@ def run(
     """Run the cells of a plan that have no result in the folder.
 
     A cell is one run: an algorithm, a class and a seed. Stop the study at any time, even with
-    kill -9, and run the same command to continue: only the cells that were running start again.
-    Several commands may share a folder, also from several machines, and divide the cells. With
-    another plan, or other --steps, --seeds or --evaluations, cells with the same content are
-    reused. Failed cells are listed; --retry runs them again.
-
-    With --agents jax, PPO, TD3 and SAC are ours in JAX instead of Stable-Baselines3's: other
-    algorithms, so no result of the one counts as one of the other. A cluster needs this package and
-    Ray in the same versions on every node, and no shared folder.
+    kill -9, and run the same command to continue. Several commands may share a folder, also from
+    several machines. With another plan or other budgets, cells with the same content are reused.
+    Agents in JAX are other algorithms: no result of theirs counts for Stable-Baselines3's. A
+    cluster needs this package and Ray in the same versions on every node.
 
     Examples:
 
       sme study run smoke --folder runs/smoke
       sme study run paper-ablations -f runs/k --only "class=k-*" --only class=default --seeds 3
-      sme study run paper-ablations -f runs/short --steps 20000 --steps PPO=100000 --jobs 8
       sme study run paper-ablations -f runs/jax --agents jax --only algorithm=PPO
       sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
     """
@@ -148,7 +143,7 @@ def check_complete(status: StudyStatus) -> None:
         raise typer.Exit(1)
 
 
-@with_options(Budgets)
+@with_options
 def status(
     folder: StudyFolder,
     options: Budgets,
@@ -177,7 +172,9 @@ def report(
     ] = "html,png,pdf,csv,latex",
     explorers: Annotated[
         bool,
-        typer.Option("--explorers", help="Also an explorer (`sme explore`) of each kept model."),
+        typer.Option(
+            "--explorers", help="Also an explorer (`sme diagnose --explore`) of each kept model."
+        ),
     ] = False,
     full: Annotated[
         bool,
@@ -326,7 +323,7 @@ def compare(
         print_line(f"{escape(str(out_folder))}  {len(files)} files")
 
 
-@with_options(PlanOptions)
+@with_options
 def sweep(
     folder: NewFolder,
     options: PlanOptions,

@@ -1,9 +1,10 @@
-"""`sme new`, `suite`, `validate` and `certify`: files of tasks and suites, and what they draw."""
+"""`sme new` and `check`: files of tasks and suites, and what they draw."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,7 @@ from rich.markup import escape
 
 from sme_registry import save
 from sme_registry.cli.arguments import (
+    KINDS,
     Force,
     Json,
     NewFile,
@@ -23,17 +25,16 @@ from sme_registry.cli.arguments import (
     find_file,
     json_or_text,
     kind_of,
+    only_with,
     print_checks,
-    read_any,
     with_options,
 )
-from sme_registry.errors import OptionError, SMEError, UnknownNameError
+from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import integer_in, parse_json
 from sme_registry.io.markup import plural
-from sme_registry.io.terminal import out, print_json, print_line, print_note
+from sme_registry.io.terminal import out, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
-    ProtocolFile,
     SMESpec,
     StreamClass,
     StreamFile,
@@ -43,11 +44,11 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
+from sme_registry.spec.catalogue import Envelope, is_path
 from sme_registry.spec.document import Document
 from sme_registry.spec.study import sweep
 from sme_registry.task import load
-from sme_registry.task.certificate import MARKS, Certificate, short
-from sme_registry.task.certificate import certify as certify_task
+from sme_registry.task.certificate import MARKS, Certificate, certify, short
 from sme_registry.task.loading import materialize_segments
 
 app = typer.Typer()
@@ -77,78 +78,18 @@ def _field_option(name: str, field: FieldInfo) -> tuple[str, Any, Any]:
     return name, Annotated[str | None, option], dataclasses.field(default=None)
 
 
+_FIRST = ("complexity", "k", "r_min", "D", "state_dim", "action_dim", "seed")  # in the help
 FieldOptions = dataclasses.make_dataclass(
     "FieldOptions",
     [
-        _field_option(name, field)
-        for name, field in SMESpec.model_fields.items()
+        _field_option(name, SMESpec.model_fields[name])
+        for name in dict.fromkeys([*_FIRST, *SMESpec.model_fields])
         if name != "schema_version"
     ],
     frozen=True,
     kw_only=True,
 )
 """An option for each field of a spec."""
-
-
-@app.command()
-@with_options(FieldOptions)
-def new(
-    path: NewFile,
-    options: Any,
-    agents: Annotated[
-        int | None, typer.Option(help="A team of this many equal agents, which observe all.")
-    ] = None,
-    base: Annotated[
-        str | None,
-        typer.Option(
-            "--from",
-            metavar="NAME|PATH",
-            help="The task to start from.",
-            autocompletion=catalogue.completion(EnvFile),
-        ),
-    ] = None,
-    name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
-    description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
-    tag: Annotated[list[str] | None, typer.Option(help="A keyword. Repeatable.")] = None,
-    force: Force = False,
-) -> None:
-    """Write a task's file: its spec, its digest, and a fingerprint of the numbers drawn from it.
-
-    Fields left out have their default, or the value of the --from task. Everyone who has the file
-    has the same task.
-
-    Examples:
-
-      sme new deep.json --complexity 20 --policy-init unit_variance --seed 7
-      sme new delayed.json --from HardDeep --k 25 --description "Paid every 25 steps."
-      sme new safe.json --safety '{"tightness": 0.2}' --policy-init unit_variance
-      sme new sealed.json --seed 0x9f86d081884c7d659a2feaa0c55ad015
-      sme new team.json --agents 4 --action-dim 8
-    """
-    check_document_path(path, force=force)
-    texts = dataclasses.asdict(options)
-    fields = {name: json_or_text(text) for name, text in texts.items() if text is not None}
-    start = SMESpec() if base is None else load(base, SMESpec)
-    if agents is not None:
-        if "team" in fields:
-            raise OptionError("--agents: --team already lists the agents. Give one or the other.")
-        alone = start.derive(**{**fields, "team": None})
-        fields["team"] = _equal_team(alone.action_dim, agents)
-    spec = start.derive(**fields)
-    save(spec, path, name, description=description, tags=tuple(tag or ()))
-    print_line(f"{escape(str(path))}  {spec.digest}")
-    print_note(f"[dim]To check the draw: sme certify {escape(str(path))}[/]")
-
-
-def _equal_team(action_dim: int, agents: int) -> dict[str, Any]:
-    integer_in("--agents", agents, 1, 1024)
-    channels, remainder = divmod(action_dim, agents)
-    if remainder or not channels:
-        raise OptionError(
-            f"--agents {agents}: action_dim={action_dim} cannot be shared equally. Change "
-            "--action-dim, or use --team for unequal agents."
-        )
-    return {"agents": [{"action_dim": channels}] * agents}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,9 +113,8 @@ class ClassOptions:
         list[str] | None,
         typer.Option(
             metavar="FIELD=VALUE,…",
-            help="Vary a field of the --task, such as k=1,2,5 or D=0,0.25: a "
-            "class for each value. Repeatable: each sweep is an axis of its own around the task, "
-            "not a cross product.",
+            help="Vary a field of the --task, such as k=1,2,5: a class for each value. Repeatable: "
+            "each is an axis of its own, not a cross product.",
         ),
     ] = None
     instances: Annotated[
@@ -223,6 +163,11 @@ def sweep_axes(texts: Iterable[str] | None) -> dict[str, list[Any]]:
             axes[field] = parse_json(f"[{values}]")
         except SMEError:
             axes[field] = [json_or_text(value.strip()) for value in values.split(",")]
+            if re.fullmatch(r"[\d.]+:[\d.]+(:[\d.]+)?", values):
+                raise OptionError(
+                    f"--sweep {field}={values}: a range is not expanded. List the values, such as "
+                    f"{field}=1,2,5,10."
+                ) from None
     return axes
 
 
@@ -232,158 +177,182 @@ def _class_name(document: SMESpec | StreamSpec) -> str:
     return title.replace(" (", "-").removesuffix(")")
 
 
-suite = typer.Typer(
-    no_args_is_help=True,
-    help="""Suites of your own: classes of tasks, each with several instances.
-
-    Examples:
-
-      sme suite new mine.json -t Default -t HardSparse --instances 5
-      sme suite new more.json --suite smoke -t Complexity50
-    """,
-)
-app.add_typer(suite, name="suite")
-
-
-@suite.command("new")
-@with_options(ClassOptions)
-def new_suite(
+@app.command()
+@with_options
+def new(
+    context: typer.Context,
     path: NewFile,
-    options: ClassOptions,
+    base: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="NAME|PATH",
+            help="The task to start from.",
+            autocompletion=catalogue.completion(EnvFile),
+        ),
+    ] = None,
+    force: Force = False,
+    *,
+    fields: FieldOptions,  # type: ignore[valid-type]
+    classes: ClassOptions,
+    agents: Annotated[
+        int | None, typer.Option(help="A team of this many equal agents, which observe all.")
+    ] = None,
     name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
     description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
-    force: Force = False,
+    tag: Annotated[list[str] | None, typer.Option(help="A keyword. Repeatable.")] = None,
 ) -> None:
-    """Write a suite's file: classes of tasks or streams, each with several instances.
+    """Write a task's file: its spec, its digest, and a fingerprint of the numbers drawn from it.
 
-    A class is one setting under several seeds, so that a method is judged on a kind of task and not
-    on one draw. Studies, leaderboards and --suite accept the file like the name of a suite;
-    leaderboards only if it has no streams.
+    Fields left out have their default, or the value of the --from task. --task or --suite write a
+    suite instead: classes of tasks or streams, each with several instances, so that a method is
+    judged on a kind of task and not on one draw.
 
     Examples:
 
-      sme suite new mine.json -t Default -t HardSparse -t k2.json --instances 5
-      sme suite new intervals.json -t Default --sweep k=1,5,25 --instances 3
-      sme suite new more.json --suite smoke -t Complexity50
-      sme suite new lives.json -t Switch5 -t Related5 --instances 5
+      sme new deep.json --complexity 20 --policy-init unit_variance --seed 7
+      sme new delayed.json --from HardDeep --k 25 --description "Paid every 25 steps."
+      sme new safe.json --safety '{"tightness": 0.2}' --policy-init unit_variance
+      sme new team.json --agents 4 --action-dim 8
+      sme new mine.json -t Default -t HardSparse -t k2.json --instances 5
+      sme new intervals.json -t Default --sweep k=1,5,25 --instances 3
     """
     check_document_path(path, force=force)
-    members = Suite.from_dict(options.members())
-    file = SuiteFile(
-        name=name or path.stem, description=description, digest=members.digest, suite=members
-    )
-    file.write(path)
-    classes = plural(len(members.runs), "class", "classes")
-    tasks = f"{classes}, {plural(sum(members.runs.values()), 'instance')}"
-    print_line(f"{escape(str(path))}  {file.digest}")
-    hint = f"{tasks}. To train an algorithm on them: sme train --suite {path} -a PPO"
+    about: dict[str, Any] = {"description": description, "tags": tuple(tag or ())}
+    texts = dataclasses.asdict(fields)
+    if classes.task or classes.suite or classes.sweep:
+        only_with(
+            context, ("base", "agents", *texts), "is for a task. Leave out --task and --suite"
+        )
+        suite = Suite.from_dict(classes.members())
+        file = SuiteFile(name=name or path.stem, digest=suite.digest, suite=suite, **about)
+        file.write(path)
+        counts = plural(len(suite.runs), "class", "classes"), sum(suite.runs.values())
+        digest, hint = file.digest, f"{counts[0]}, {plural(counts[1], 'instance')}. To train: "
+        hint += f"sme train --suite {path} -a PPO"
+    else:
+        only_with(context, ("instances",), "is for a suite. Add --task")
+        values = {key: json_or_text(text) for key, text in texts.items() if text is not None}
+        spec = _new_spec(values, base, agents)
+        save(spec, path, name, force=True, **about)
+        digest, hint = spec.digest, f"To check the draw: sme check {path}"
+    print_line(f"{escape(str(path))}  {digest}")
     print_note(f"[dim]{escape(hint)}[/]")
 
 
-@app.command()
-def validate(
-    paths: Annotated[list[Path], typer.Argument(help="Files, or folders of .json files.")],
-    json: Json = False,
-) -> None:
-    """Check files of tasks, suites, protocols and studies.
-
-    It checks the JSON, the fields, the digest, and the fingerprint of the drawn numbers. Every
-    file is checked, even after an invalid one. Exit code 2 if any file is invalid.
-
-    Examples:
-
-      sme validate mine.json
-      sme validate specs/envs specs/suites
-    """
-    results = [_check(file) for path in paths for file in _files(path)]
-    print_checks(results, "files", json=json)
+def _new_spec(fields: dict[str, Any], base: str | None, agents: int | None) -> SMESpec:
+    start = SMESpec() if base is None else load(base, SMESpec)
+    if agents is not None:
+        if "team" in fields:
+            raise OptionError("--agents: --team already lists the agents. Give one or the other.")
+        alone = start.derive(**{**fields, "team": None})
+        fields["team"] = _equal_team(alone.action_dim, agents)
+    return start.derive(**fields)
 
 
-def _files(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return [path]
-    files = sorted(path.rglob("*.json"))
-    if not files:
-        raise OptionError(f"{path}: contains no .json file. Give files, or a folder of them.")
-    return files
-
-
-def _check(path: Path) -> dict[str, Any]:
-    result: dict[str, Any] = {"path": str(path), "valid": False, "kind": None, "error": None}
-    try:
-        file = read_any(path)
-        result |= {"kind": kind_of(file), "name": file.versioned_name, "digest": file.digest}
-        if isinstance(file, EnvFile | StreamFile):
-            materialize_segments(*file.published)
-        elif isinstance(file, SuiteFile):
-            _ = file.suite.documents
-        elif isinstance(file, StudyFile):
-            _ = file.plan.cells
-    except SMEError as error:
-        text = str(error)
-        return result | {"error": text if str(path) in text else f"{path}: {text}"}
-    return result | {"valid": True}
+def _equal_team(action_dim: int, agents: int) -> dict[str, Any]:
+    integer_in("--agents", agents, 1, 1024)
+    channels, remainder = divmod(action_dim, agents)
+    if remainder or not channels:
+        raise OptionError(
+            f"--agents {agents}: action_dim={action_dim} cannot be shared equally. Change "
+            "--action-dim, or use --team for unequal agents."
+        )
+    return {"agents": [{"action_dim": channels}] * agents}
 
 
 @app.command()
-def certify(
-    tasks: Annotated[
+def check(
+    names: Annotated[
         list[str],
         typer.Argument(
             metavar="NAME|PATH...",
-            help="Tasks or suites to check.",
-            autocompletion=catalogue.completion(EnvFile, SuiteFile),
+            help="Tasks, streams, suites, protocols or studies; or folders of their files.",
+            autocompletion=catalogue.completion(*KINDS.values()),
         ),
     ],
+    files_only: Annotated[
+        bool, typer.Option("--files-only", help="Check the files, but not what they draw.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the states and actions used.")] = 0,
     json: Json = False,
 ) -> None:
-    """Draw a task and check that it is sound, before training on it.
+    """Check files, and that the tasks they draw are sound, before you train on them.
 
-    A broken or trivial task is refused. A warning marks a valid but easy one, such as a
-    semi_orthogonal policy of 2 to 5 layers, whose target stays near the middle, or one whose limits
-    bind more or less often than its tightness says. Exit code 1 if any task is refused.
+    Of a file: its JSON, its fields, its digest, and the fingerprint of the drawn numbers. Every
+    file is checked, even after an invalid one; exit code 2 if any is invalid.
+
+    Of a task: a broken or trivial one is refused, with exit code 1. A warning marks a valid but
+    easy one, such as a semi_orthogonal policy of 2 to 5 layers, whose target stays near the middle.
 
     Examples:
 
-      sme certify mine.json
-      sme certify core smoke
+      sme check mine.json
+      sme check core smoke
+      sme check specs/envs specs/suites --files-only
     """
-    specs = [entry for name in tasks for entry in _tasks(name)]
-    certificates: list[tuple[str, Certificate]] = []
-    for label, spec in specs:
-        certificate = certify_task(spec, seed=seed)
-        certificates.append((label, certificate))
-        if json:
-            continue
-        if len(specs) == 1:
-            out().print(certificate.table(f"Certificate of {escape(label)}"))
-        notable = [*certificate.of("refused"), *certificate.of("warning")]
-        reasons = ", ".join(f"{check.name} {short(check.value)}".rstrip() for check in notable)
-        print_line(f"{MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]")
-    if json:
-        print_json([{"task": label, **each.to_dict()} for label, each in certificates])
-    if not all(certificate.passed for _, certificate in certificates):
+    passed: list[bool] = []
+
+    def checked() -> Iterator[dict[str, Any]]:
+        whats = [name for each in names for name in _files(each)]
+        for name in whats:
+            result, tasks = _check(name)
+            yield result
+            result["certificates"] = []
+            for label, spec in () if files_only else tasks:
+                certificate = certify(spec, seed=seed)
+                passed.append(certificate.passed)
+                result["certificates"].append({"task": label, **certificate.to_dict()})
+                if not json:
+                    _print_certificate(label, certificate, table=len(whats) == len(tasks) == 1)
+
+    print_checks(checked(), "files", json=json)
+    if not all(passed):
         print_note("Of a refused task, use another seed, or change a field.")
         raise typer.Exit(1)
 
 
-def _tasks(name: str) -> list[tuple[str, SMESpec]]:
-    document = find_any(name)
-    if isinstance(document, ProtocolFile | StudyFile):
-        raise UnknownNameError(
-            f"{name!r}: is a {kind_of(document)}. Give a task, a stream or a suite."
-        )
-    if isinstance(document, SuiteFile):
+def _files(name: str) -> list[str]:
+    """The files of a folder; any other name alone."""
+    if not Path(name).is_dir():
+        return [name]
+    files = sorted(map(str, Path(name).rglob("*.json")))
+    if not files:
+        raise OptionError(f"{name}: contains no .json file. Give files, or a folder of them.")
+    return files
+
+
+def _check(name: str) -> tuple[dict[str, Any], list[tuple[str, SMESpec]]]:
+    """Whether a document is valid, and the tasks in it. An unknown name is an error at once."""
+    result: dict[str, Any] = {"name": name, "valid": False, "kind": None, "error": None}
+    try:
+        document = find_any(name)
+        tasks = _tasks(name, document)
+    except SMEError as error:
+        if not is_path(name):
+            raise
+        text = str(error)
+        return result | {"error": text if name in text else f"{name}: {text}"}, []
+    if not isinstance(document, SMESpec | StreamSpec):
+        result["kind"] = kind_of(document)
+    return result | {"valid": True, "digest": document.digest}, tasks
+
+
+def _tasks(name: str, document: Envelope | SMESpec | StreamSpec) -> list[tuple[str, SMESpec]]:
+    """The tasks of a document; those of a file are drawn, and have its fingerprints."""
+    if isinstance(document, StudyFile):
+        _ = document.plan.cells
+    elif isinstance(document, SuiteFile):
         suite = document.suite
         labels = [f"{document.name}/{member} {kind} {n}" for member, kind, n in suite.places]
         instances = zip(labels, suite.documents, strict=True)
         return [task for label, instance in instances for task in _phases(label, instance)]
-    if isinstance(document, EnvFile | StreamFile):
+    elif isinstance(document, EnvFile | StreamFile):
         materialize_segments(*document.published)
         return _phases(name, document.published.document)
-    assert isinstance(document, SMESpec | StreamSpec)
-    return _phases(name, document)
+    elif isinstance(document, SMESpec | StreamSpec):
+        return _phases(name, document)
+    return []
 
 
 def _phases(label: str, document: SMESpec | StreamSpec) -> list[tuple[str, SMESpec]]:
@@ -391,3 +360,11 @@ def _phases(label: str, document: SMESpec | StreamSpec) -> list[tuple[str, SMESp
     if isinstance(document, SMESpec):
         return [(label, document)]
     return [(f"{label} phase {index}", spec) for index, spec in enumerate(document.specs)]
+
+
+def _print_certificate(label: str, certificate: Certificate, *, table: bool) -> None:
+    if table:
+        out().print(certificate.table(f"Certificate of {escape(label)}"))
+    notable = [*certificate.of("refused"), *certificate.of("warning")]
+    reasons = ", ".join(f"{each.name} {short(each.value)}".rstrip() for each in notable)
+    print_line(f"{MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]")

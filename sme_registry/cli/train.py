@@ -1,4 +1,4 @@
-"""`sme train`: an algorithm on a task, a stream or a suite; `sme demo`: all of it on one task."""
+"""`sme train`: an algorithm on tasks or on a data set; `sme demo`: all of it on one task."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from sme_registry.cli.arguments import (
     Force,
     Json,
     Out,
-    Protocol,
-    changed,
     changes,
     find_file,
+    load_changed,
     only_with,
     print_training,
     print_written,
@@ -26,13 +25,19 @@ from sme_registry.cli.arguments import (
 )
 from sme_registry.cli.plan import Jobs, warn_of_uneven_rollouts
 from sme_registry.cli.study import check_complete, print_status
+from sme_registry.datasets import open_dataset, train_offline
+from sme_registry.datasets.documents import check_algorithm
+from sme_registry.datasets.offline import train_sealed
+from sme_registry.datasets.storage import is_sealed
 from sme_registry.diagnosis import load_run
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.evaluation.evaluate import resolve_protocol
+from sme_registry.io import check_new
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import err, print_note
+from sme_registry.io.terminal import Progress, count, err, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
+    ProtocolFile,
     SMESpec,
     StreamFile,
     StreamSpec,
@@ -54,13 +59,18 @@ RUNS = 10
 app = typer.Typer()
 
 _EVALUATIONS = 10  # of a run, for the learning curves of `sme study report`
-_OF_A_TASK = ("task", "seed", "num_envs", "checkpoint_every", "resume", "force")
+_OF_A_TASK = ("task", "num_envs", "checkpoint_every", "resume")
 _OF_A_SUITE = ("seeds", "jobs")
+_PASSED_ON = (  # to `training.train`
+    *("steps", "seed", "independent", "action_range", "num_envs", "checkpoint_every"),
+    *("resume", "force", "agents", "device"),
+)
+_OF_AN_ENVIRONMENT = ("agents", "device", "action_range", "independent", "hyperparameters")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Options of a training on a task, a stream or each instance of a suite."""
+    """Options of a training on a task, a stream, each instance of a suite, or a data set."""
 
     algorithm: Annotated[
         str | None,
@@ -68,8 +78,29 @@ class Settings:
             "--algorithm",
             "-a",
             help="TD3, SAC, DDPG, PPO, A2C, module:Class, such as sb3_contrib:TQC, or "
-            "train:module:function for a function of yours; for tasks with safety also "
-            "PPOLagrangian, PPOProjection. Default TD3, for teams PPO.",
+            "train:module:function; for tasks with safety also PPOLagrangian, PPOProjection. "
+            "Default TD3, for teams PPO; of --data bc or iql, the default.",
+        ),
+    ] = None
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            "--steps",
+            "-n",
+            parser=count,
+            metavar="INTEGER",
+            help="Environment steps, for a team of the team; of --data gradient steps. Default "
+            "20,000, and those of a stream.",
+        ),
+    ] = None
+    seed: Annotated[int, typer.Option(help="Seed of the algorithm and of the start states.")] = 0
+    out_folder: Out = None
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Change a field of the task or a hyperparameter of the algorithm. Repeatable.",
         ),
     ] = None
     agents: Annotated[
@@ -80,38 +111,62 @@ class Settings:
             "with the environment in one program.",
         ),
     ] = None
-    device: Annotated[
-        str | None, typer.Option(help="Of agents in JAX: cpu, gpu or tpu. Default JAX's.")
-    ] = None
-    steps: Annotated[
-        int | None,
+    suite: Annotated[
+        str | None,
         typer.Option(
-            "--steps",
-            "-n",
-            help="Environment steps; for a team, of the team. Default 20,000, and those of a "
-            "stream.",
+            help="Instead of a TASK: train on every instance of a suite, by its name or path.",
+            autocompletion=catalogue.completion(SuiteFile),
         ),
     ] = None
-    out_folder: Out = None
+    data: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DATASET",
+            help="Instead of a TASK: train on a data set, by its id from `sme data list` or its "
+            "folder, never in the environment.",
+        ),
+    ] = None
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False
+    force: Force = False
+    json: Json = False
+    protocol: Annotated[
+        str | None,
+        typer.Option(
+            help="Evaluation protocol; default paper-v1, of --data the data set's.",
+            autocompletion=catalogue.completion(ProtocolFile),
+        ),
+    ] = None
+    hyperparameters: Annotated[
+        Path | None, typer.Option(help="Hyperparameters in a JSON file.", dir_okay=False)
+    ] = None
+    num_envs: Annotated[
+        int | None,
+        typer.Option(
+            help="Environments (teams) at once; the algorithm stays the same. Default 1; on-policy "
+            "for a team 8."
+        ),
+    ] = None
     action_range: Annotated[
         str, typer.Option(help="Action space: symmetric, [-1, 1], or unit, [0, 1].")
     ] = "symmetric"
     independent: Annotated[
         bool, typer.Option("--independent", help="One model for each agent of a team.")
     ] = False
-    protocol: Protocol = "paper-v1"
-    set_: Annotated[
-        list[str] | None,
+    checkpoint_every: Annotated[
+        int | None,
+        typer.Option(help="Steps between checkpoints; default a twentieth of all, at least 1,000."),
+    ] = None
+    device: Annotated[
+        str | None, typer.Option(help="Of agents in JAX: cpu, gpu or tpu. Default JAX's.")
+    ] = None
+    seeds: Annotated[
+        int | None,
         typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="Change a field of the task or a hyperparameter of the algorithm. Repeatable.",
+            help="With --suite: runs on each class, in turn on its instances. Default 10, or more "
+            "for equally many on each instance.",
         ),
     ] = None
-    hyperparameters: Annotated[
-        Path | None,
-        typer.Option(metavar="CHECKPOINT", help="Hyperparameters in a JSON file.", dir_okay=False),
-    ] = None
+    jobs: Jobs = None
 
     def changes(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """The changes of the task, and the hyperparameters from a file and from --set."""
@@ -135,7 +190,7 @@ class Settings:
 
 
 @app.command()
-@with_options(Settings)
+@with_options
 def train(
     context: typer.Context,
     options: Settings,
@@ -147,105 +202,61 @@ def train(
             autocompletion=catalogue.completion(EnvFile, StreamFile),
         ),
     ] = None,
-    suite: Annotated[
-        str | None,
-        typer.Option(
-            help="Instead of a TASK: train on every instance of a suite, by its name or path.",
-            autocompletion=catalogue.completion(SuiteFile),
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the algorithm and of the start states.")] = 0,
-    seeds: Annotated[
-        int | None,
-        typer.Option(
-            help="With --suite: runs on each class, in turn on its instances. Default 10, or more "
-            "for equally many on each instance.",
-        ),
-    ] = None,
-    jobs: Jobs = None,
-    num_envs: Annotated[
-        int | None,
-        typer.Option(
-            help="Environments (teams) at once; the algorithm stays the same. Default 1; on-policy "
-            "for a team 8."
-        ),
-    ] = None,
-    checkpoint_every: Annotated[
-        int | None,
-        typer.Option(help="Steps between checkpoints; default a twentieth of all, at least 1,000."),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
-    force: Force = False,
-    json: Json = False,
 ) -> None:
     """Train an algorithm, log the exact regret of each episode, and evaluate the trained policy.
 
-    The output folder, by default runs/TASK-ALGORITHM-seedN, contains episodes.csv, checkpoint.zip,
-    model.zip, run.json, evaluation.json, figures, explorer.html (`sme explore`), and logs that
-    `tensorboard --logdir runs` shows; of a stream, stream.json and a model for each visit.
-
-    --set changes a field of the task (`sme show TASK`) or a hyperparameter, whose names and
-    defaults are those of the algorithm's class in Stable-Baselines3. Values are JSON or text; dots
-    lead into a block, as in policy_kwargs.net_arch=[64,64].
-
-    The agents of a team share one policy (for its observation see `sme evaluate --help`). With
-    --independent, each agent has a model of its own, which learns from its own rewards.
-
-    --suite trains on all instances of a suite at once, as `sme study run --keep-models` would, into
-    runs/SUITE-ALGORITHM, a study's folder: the same command continues it, `sme study status` and
-    `report` read it, and `sme-leaderboard submit` submits it.
-
-    --resume continues an interrupted run from its last checkpoint; --steps may be larger.
+    Writes the record, the model, figures and an explorer to runs/TASK-ALGORITHM-seedN. --set takes
+    fields of the task (`sme show TASK`) and hyperparameters by their names in Stable-Baselines3.
+    --suite writes a study's folder, which the same command continues and `sme study` reads. --data
+    trains bc or iql on a data set, of a sealed one without an evaluation.
 
     Examples:
 
       sme train Default --steps 20000 --seed 1
-      sme train Default -a PPO -n 100000 --agents jax
-      sme train Default -a PPO -n 100000 --num-envs 8 --set complexity=10 --set learning_rate=1e-4
-      sme train Default -a sb3_contrib:TQC --set top_quantiles_to_drop_per_net=5
+      sme train Default -a PPO -n 1e5 --agents jax --set complexity=10 --set learning_rate=1e-4
       sme train mine.json --out runs/mine --resume
-      sme train Team4 --steps 40000
       sme train Team4 --independent --steps 40000
-      sme train Switch5 -a PPO --agents jax
-      sme train Safety20 -a PPOLagrangian -n 100000 --set cost_limit=0.02
       sme train --suite mine.json -a PPO --out runs/mine
+      sme train --data sme/Default-v1-nu50-seed7-v0 -a iql
     """
-    if suite is not None:
-        only_with(context, _OF_A_TASK, "is for a single task. Leave it out, or --suite")
-        _train_suite(context, suite, options, seeds, jobs, json=json)
-        return
-    only_with(context, _OF_A_SUITE, "is for --suite. Add --suite, or leave it out")
-    if task is None:
-        raise OptionError("Give a TASK or --suite, such as Default. See `sme train --help`.")
+    if options.data is not None:
+        foreign = (*_OF_A_TASK, "suite", *_OF_A_SUITE, *_OF_AN_ENVIRONMENT)
+        only_with(context, foreign, "is not for --data. Leave one of them out")
+        _train_on_data(options, options.data)
+    elif options.suite is not None:
+        others = (*_OF_A_TASK, "seed", "force")
+        only_with(context, others, "is for a single task. Leave it out, or --suite")
+        _train_suite(context, options, options.suite)
+    else:
+        only_with(context, _OF_A_SUITE, "is for --suite. Add --suite, or leave it out")
+        if task is None:
+            raise OptionError("Give a TASK, --suite or --data. See `sme train --help`.")
+        _train_task(options, task)
+
+
+def _train_task(options: Settings, task: str) -> None:
     overrides, settings = options.changes()
     document = load(task)
     if isinstance(document, StreamSpec):
         overrides |= {name: settings[name] for name in settings if name in StreamSpec.model_fields}
-    document = changed(document, task, overrides)
+    document = load_changed(task, overrides)
     uses = options.uses(document)
     algorithms.check_hyperparameters(uses, settings, others=SMESpec.model_fields)
-    folder = options.folder(_label(task, document, changed=bool(overrides)), uses, f"-seed{seed}")
+    folder = options.folder(
+        _label(task, document, changed=bool(overrides)), uses, f"-seed{options.seed}"
+    )
     result = _train(
         document,
         folder,
         "the same command with --resume",
         algorithm=uses,
-        steps=options.steps,
-        seed=seed,
         hyperparameters=settings,
-        independent=options.independent,
-        action_range=options.action_range,
-        num_envs=num_envs,
-        checkpoint_every=checkpoint_every,
-        protocol=options.protocol,
-        resume=resume,
-        force=force,
-        agents=options.agents,
-        device=options.device,
+        protocol=options.protocol or "paper-v1",
+        **{name: getattr(options, name) for name in _PASSED_ON},
     )
     if result.record.stream is None:
         _write_explorer(folder)
-    print_training(result, folder, json=json)
+    print_training(result, folder, json=options.json)
 
 
 def _train(
@@ -267,6 +278,54 @@ def _train(
         raise KeyboardInterrupt(message) from None
 
 
+def _train_on_data(options: Settings, data: str) -> None:
+    settings = changes(options.set_)
+    algorithm, _ = check_algorithm(options.algorithm or "iql")
+    steps = DEFAULT_STEPS if options.steps is None else options.steps
+    arguments: dict[str, Any] = {"algorithm": algorithm, "steps": steps, "seed": options.seed}
+    arguments |= {name: settings.pop(name) for name in ("batch_size",) if name in settings}
+    title = f"training {algorithm.upper()}"
+    with Progress(title, max(1, steps), console=err()) as progress:
+        if is_sealed(data):
+            if options.out_folder is None:
+                raise OptionError("--out: is required with a sealed data set: the policy's .npz.")
+            check_new(options.out_folder, force=options.force)
+            policy = train_sealed(
+                data,
+                **arguments,
+                hyperparameters=settings,
+                progress=lambda done, _: progress.update(done),
+            )
+            policy.save(options.out_folder)
+            print_line(escape(str(options.out_folder)))
+            return
+        dataset = open_dataset(data)
+        name = f"{dataset.id.rsplit('/', 1)[-1]}-{algorithm}-seed{options.seed}"
+        folder = options.out_folder or Path("runs") / name
+        result = train_offline(
+            dataset,
+            **arguments,
+            hyperparameters=settings,
+            evaluations=min(20, max(1, steps)),
+            protocol=options.protocol,
+            folder=folder,
+            force=options.force,
+            progress=lambda done, total, note: progress.update(done, note),
+        )
+    print_training(result, folder, [_improvement(result.record)], json=options.json)
+
+
+def _improvement(record: Any) -> Table:
+    algorithm = record.algorithm.upper()
+    rows = [
+        {"": f"behaviour, {record.transitions:,} transitions", "r̃": record.behaviour.similarity},
+        {"": f"{algorithm}, {record.episodes} episodes", "r̃": record.evaluations[-1].similarity},
+        {"": "improvement", "r̃": record.improvement},
+    ]
+    rows = [row | {"r̃": f"{row['r̃']:.3f}"} for row in rows]
+    return Table.of(f"{algorithm} on {escape(record.dataset)}", rows)
+
+
 def _write_explorer(folder: Path) -> list[Path]:
     """Write the explorer of a run; where that cannot be, say so: the run is complete without."""
     try:
@@ -284,21 +343,13 @@ def _label(task: str, document: SMESpec | StreamSpec, *, changed: bool) -> str:
     return Path(task).name.removesuffix(".json").removesuffix("-v1")
 
 
-def _train_suite(
-    context: typer.Context,
-    name: str,
-    options: Settings,
-    seeds: int | None,
-    jobs: int | None,
-    *,
-    json: bool,
-) -> None:
+def _train_suite(context: typer.Context, options: Settings, name: str) -> None:
     """Train on every instance of a suite and keep the models; the same call continues."""
     fields, settings = options.changes()
     for field in fields:
         raise OptionError(
             f"--set {field}: is a field of the task, and the suite sets it. Write another suite "
-            f"with `sme suite new`, for example from `sme new task.json --set {field}=…`."
+            "with `sme new`, such as sme new suite.json -t task.json."
         )
     file = find_file(SuiteFile, name)
     suite = file.suite
@@ -317,20 +368,20 @@ def _train_suite(
     fields = {name: members[name] for name in ("classes", "streams") if name in members}
     fields |= {
         "algorithms": [algorithm],
-        "seeds": equal_runs(suite) if seeds is None else seeds,
+        "seeds": equal_runs(suite) if options.seeds is None else options.seeds,
         "steps": DEFAULT_STEPS if options.steps is None else options.steps,
         "evaluations": _EVALUATIONS,
-        "protocol": resolve_protocol(options.protocol).to_dict(),
+        "protocol": resolve_protocol(options.protocol or "paper-v1").to_dict(),
     }
     plan = StudyPlan.from_dict(fields, "options")
     warn_of_uneven_rollouts(plan)
     study = StudyFile(name=file.name, digest=plan.digest, plan=plan)
     status = run_study(
-        study, folder, jobs=jobs, keep_models=True, device=options.device, console=err()
+        study, folder, jobs=options.jobs, keep_models=True, device=options.device, console=err()
     )
-    print_status(status, json)
+    print_status(status, options.json)
     check_complete(status)
-    if not json:
+    if not options.json:
         print_note(f"[dim]{escape(_next_step(suite, plan, folder))}[/]")
 
 

@@ -54,6 +54,7 @@ from sme_registry.io import (
     build_folder,
     check_writable,
     choice,
+    is_regular,
     read_json,
     to_json,
     versions,
@@ -65,6 +66,7 @@ from sme_registry.spec.suite import ProtocolLike
 from sme_registry.task import load, materialize
 from sme_registry.task.task import Array, Mask, Observation
 
+_SEALED = "sealed/"  # begins the id of a season's data set
 _NAMESPACE = "namespace_metadata.json"
 _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "h5py", "minari")
@@ -361,15 +363,22 @@ def open_dataset(
         known = [dataset_id for dataset_id, _ in _folders(root)]
         raise UnknownNameError(
             f"{os.fspath(id_or_path)!r}: is neither the id of a data set in {root} nor the path of "
-            f"one.{did_you_mean(os.fspath(id_or_path), known)} `sme dataset list` lists them."
+            f"one.{did_you_mean(os.fspath(id_or_path), known)} `sme data list` lists them."
         )
     dataset = _open(path)
     if dataset is None:
         raise MalformedDocumentError(
-            f"{path / 'data' / METADATA}: was not written by `sme dataset make`. Minari can open "
+            f"{path / 'data' / METADATA}: was not written by `sme data make`. Minari can open "
             "it: minari.MinariDataset(path)."
         )
     return dataset
+
+
+def is_sealed(path: str | os.PathLike[str]) -> bool:
+    """Whether a folder is that of a season's data set, which does not name its task."""
+    if not is_regular(Path(path) / "data" / METADATA):
+        return False
+    return str(_read_metadata(Path(path)).get("dataset_id")).startswith(_SEALED)
 
 
 def _read_metadata(path: Path) -> dict[str, Any]:

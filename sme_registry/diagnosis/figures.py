@@ -98,7 +98,7 @@ def _channels(diagnosis: TaskDiagnosis, figure: Figure) -> None:
     for axes in (left, right):
         axes.set(xlabel=f"action channel{cut}", xticks=x[:: max(1, len(x) // 8)])
     regrets = {
-        "this policy": [c.normalised_regret for c in channels],
+        diagnosis.name: [c.normalised_regret for c in channels],
         LABELS[LINEAR]: [c.linear_normalised_regret for c in channels],
     }
     _bars(left, x, regrets, beside=LABELS[LINEAR])
@@ -145,7 +145,7 @@ def _states(diagnosis: TaskDiagnosis, figure: Figure) -> None:
         name: [shell.scores[name].normalised_regret for shell in measured.shells]
         for name in (POLICY, *_REFERENCES)
     }
-    _lines(right, levels, {"this policy": regrets.pop(POLICY)})
+    _lines(right, levels, {diagnosis.name: regrets.pop(POLICY)})
     for name, values in regrets.items():
         draw_reference(right, name, levels, values, LABELS[name])
     right.set_xticks(levels, ["WD", *(f"{level:g}" for level in levels[1:])])
@@ -199,7 +199,7 @@ def _squared_error(diagnosis: TaskDiagnosis, figure: Figure) -> None:
             linewidth=0.5, label=label,
         )  # fmt: skip
         start = start + widths
-    right.set_yticks((0, 1), ("this policy", "random\nactions"))
+    right.set_yticks((0, 1), (diagnosis.name, "random\nactions"))
     right.set(xlabel="share of steps", xlim=(0.0, 1.0), ylim=(1.6, -0.6))
     right.grid(visible=False, axis="y")
     legend_above(right, ncols=3, columnspacing=1.0, handlelength=1.4)

@@ -189,7 +189,7 @@ class OfflinePolicy(Perceptron):
             ) from None
         except (OSError, zipfile.BadZipFile, KeyError, ValueError, EOFError, SMEError) as error:
             raise PolicyError(
-                f"{os.fspath(path)}: not a policy that `sme offline train` wrote: {error}"
+                f"{os.fspath(path)}: not a policy that `sme train --data` wrote: {error}"
             ) from None
 
     @classmethod

@@ -249,6 +249,12 @@ def _named(text: str, spec: SMESpec) -> tuple[Any, str]:
     path = Path(text)
     if text in (*POLICIES, *OLD_NAMES):
         return reference_policy(text, spec), OLD_NAMES.get(text, text)
+    if path.suffix in (".pt", ".pth"):
+        raise PolicyError(
+            f"policy={text!r}: is a PyTorch file, which lacks the network's code. In Python, pass "
+            "the loaded torch.nn.Module to `sme_registry.evaluate`, or write it with "
+            "`sme_registry.export_onnx` and give the .onnx file."
+        )
     if text.endswith(_SUFFIXES) or os.path.isfile(text):
         return path, path.stem
     if os.path.isdir(text):

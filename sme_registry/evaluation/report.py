@@ -83,9 +83,9 @@ class ReportFile(DigestedFile):
     def table(self) -> Table:
         """The report as a table."""
 
-    def tables(self) -> list[Table]:
-        """All tables of the report."""
-        return [self.table()]
+    @abstractmethod
+    def tables(self, *, details: bool = False) -> list[Table]:
+        """What is shown by default: at most four numbers a region; with `details` all tables."""
 
     def _repr_html_(self) -> str:
         """The tables, for notebooks."""
@@ -301,8 +301,10 @@ class EvaluationReport(ReportFile):
                 table.add("  of linear", _of(linear, "normalised_regret"))
         return table
 
-    def tables(self) -> list[Table]:
-        """`table`, and those of safety, of distractors and of probes where there are any."""
+    def tables(self, *, details: bool = False) -> list[Table]:
+        """A summary; or `table`, and those of safety, distractors and probes if there are any."""
+        if not details:
+            return [self._summary()]
         tables = [self.table()]
         if self.safety is not None:
             tables.append(_safety_table(self, self.safety))
@@ -311,6 +313,23 @@ class EvaluationReport(ReportFile):
         if self.observed.probes:
             tables.append(_probe_table(self))
         return tables
+
+    def _summary(self) -> Table:
+        """Similarity, N, and what the task adds: cost, and sensitivity to distractors."""
+        heading = f"\nWD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}"
+        table = RegionTable(_title(self) + heading, self.regions, _SUMMARY)
+        known = [name for name in _SHOWN_REFERENCES if name in self.others]
+        policies = {"": escape(self.policy)} | {name: _label(name) for name in known}
+        regions: dict[str, Any] = {"": self.regions, **self.references}
+        for field in ("similarity", "normalised_regret"):
+            rows = [(policies[name], _of(regions[name], field)) for name in policies]
+            table.add_group(REGION_METRICS[field].label, rows)
+        if self.safety is not None:
+            costs = {"": self.safety.regions, **self.safety.references}
+            table.add_group("cost", [(policies[x], _of(costs[x], "cost")) for x in policies])
+        if self.observed.sensitivity:
+            table.add("sensitivity", _of(self.observed.sensitivity, "sensitivity"))
+        return table
 
 
 def renamed(data: Any, names: Mapping[str, str] = NEW_NAMES, depth: int = 8) -> Any:
@@ -342,6 +361,8 @@ def _columns(region: RegionReport) -> dict[str, Any]:
     return {"region": region.name} | region.model_dump(exclude={"name", "channels"})
 
 
+_SHOWN_REFERENCES = ("linear", "constant", "random", "optimal")
+_SUMMARY = "Normalised regret: 0 optimal, 1 the constant ½. More numbers: --all, and the JSON."
 _SAFETY = {
     "step_reward": "step reward r",
     "cost": "cost",

@@ -178,7 +178,7 @@ class StreamReport(ReportFile):
             f"average performance {final:.3f}>"
         )
 
-    def table(self) -> Table:
+    def table(self, *, details: bool = True) -> Table:
         """The metrics at the end of the life: a column for each region."""
         stream, regions, regret = self.stream, self.regions, self.dynamic_regret
         cost = ""
@@ -195,7 +195,7 @@ class StreamReport(ReportFile):
         for name in regions[0].references:
             lives = [region.references[name] for region in regions]
             agents.append((escape(LABELS.get(name, name)), lives))
-        for metric, label in METRICS.items():
+        for metric, label in list(METRICS.items())[: None if details else _SHOWN_METRICS]:
             rows = [(name, [life.final(metric) for life in lives]) for name, lives in agents]
             table.add_group(label, rows)
         return table
@@ -243,14 +243,18 @@ class StreamReport(ReportFile):
         table.add_row("dynamic regret (sum)", *sums)
         return table
 
-    def tables(self) -> list[Table]:
+    def tables(self, *, details: bool = False) -> list[Table]:
         """`table`, `matrix`, and `regret` where a dynamic regret is known."""
         known = self.dynamic_regret or self.reference_regret
-        return [self.table(), self.matrix(), *([self.regret()] if known else [])]
+        table = self.table(details=details)
+        return [table, self.matrix(), *([self.regret()] if known else [])]
 
     @property
     def _visit_labels(self) -> list[str]:
         return [f"visit {visit.visit}: phase {visit.phase}" for visit in self.visits]
+
+
+_SHOWN_METRICS = 4  # by default
 
 
 def _cells(row: Iterable[float | None]) -> list[str]:

@@ -280,7 +280,7 @@ def integer_in(
     if number is None or number < low or (high is not None and number > high):
         allowed = f"of at least {low:,}" if high is None else f"in [{low:,}, {high:,}]"
         advice = advice and f" {advice}"
-        raise OptionError(f"{name}={value!r:.60}: must be an integer {allowed}.{advice}")
+        raise OptionError(f"{name}={_shown(value)}: must be an integer {allowed}.{advice}")
     return number
 
 
@@ -289,8 +289,13 @@ def number_in(name: str, value: Any, low: float, high: float = math.inf) -> floa
     is_number = isinstance(value, int | float | np.number) and type(value).__name__ != "bool"
     if not is_number or not (math.isfinite(value) and low <= value <= high):
         allowed = f"of at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-        raise OptionError(f"{name}={value!r:.60}: must be a finite number {allowed}.")
+        raise OptionError(f"{name}={_shown(value)}: must be a finite number {allowed}.")
     return float(value)
+
+
+def _shown(value: Any) -> str:
+    """A value as a user would type it: `1.7`, not `np.float64(1.7)`."""
+    return repr(value.item() if isinstance(value, np.generic) else value)[:60]
 
 
 def choice(

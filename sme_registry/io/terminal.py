@@ -29,7 +29,7 @@ from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
-from sme_registry.errors import OptionError, SMEError
+from sme_registry.errors import OptionError, SMEError, did_you_mean
 from sme_registry.io.files import to_json
 from sme_registry.io.system import hidden_in, missing_dependency, visible
 
@@ -63,17 +63,21 @@ _UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
 
 
 class _Console(Console):
-    """Shows hidden characters as escapes: a name from elsewhere may hold any.
+    """Shows hidden characters as escapes and `:x:` as it is: a name from elsewhere may hold any.
 
     It wraps no lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
     """
 
     def __init__(self, file: TextIO) -> None:
-        super().__init__(file=file, highlight=False)
+        super().__init__(file=file, highlight=False, emoji=False)
         # FORCE_COLOR, which Jupyter sets: colours in a pipe, but nothing that moves the cursor.
         if self.is_terminal and os.environ.get("FORCE_COLOR") and not file.isatty():
             super().__init__(
-                file=file, highlight=False, force_terminal=False, color_system="standard"
+                file=file,
+                highlight=False,
+                emoji=False,
+                force_terminal=False,
+                color_system="standard",
             )
         if not self.is_terminal:
             self.width = _UNLIMITED
@@ -183,13 +187,13 @@ class Progress:
         self._rate_from = self._done, self._start
         if self._enabled and self._console.is_terminal:
             self._bars = Bars(
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),  # else :x: becomes an emoji
                 BarColumn(bar_width=24),
-                TextColumn("{task.fields[text]}"),
+                TextColumn("{task.fields[text]}", markup=False),
                 console=self._console,
             )
             self._tasks[""] = self._bars.add_task(
-                escape(self._title), total=self._total, completed=self._done, text=""
+                self._title, total=self._total, completed=self._done, text=""
             )
             self._bars.start()
         return self
@@ -232,7 +236,7 @@ class Progress:
         """Show a part of the job that runs from now on, and what it does first."""
         self._parts[name] = f"({note})" if note else "0%"
         if self._bars is not None:
-            label = f"  {escape(name)}"
+            label = f"  {name}"
             self._tasks[name] = self._bars.add_task(label, total=1.0, text=note or "starting")
         self._refresh()
 
@@ -325,14 +329,14 @@ class CommandGroup(TyperGroup):
             self.commands[name] = TyperCommand(
                 name, help=summary, hidden=not summary, rich_help_panel=panel[0] if panel else None
             )
-        _show_literally(self)
+        _arrange_help(self)
 
     def load(self, name: str) -> Any:
         """The command of a name; its module is imported."""
         if name in self.modules:
             module = importlib.import_module(self.modules[name][0])
             self.commands[name] = get_group(module.app).commands[name]
-            _show_literally(self.commands[name])
+            _arrange_help(self.commands[name])
         return self.commands[name]
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -357,7 +361,7 @@ class CommandGroup(TyperGroup):
                 raise
             context = getattr(error, "ctx", None)
             command = context.command_path if context is not None else self.name
-            message = error.format_message().replace("Value error, ", "").rstrip(".")
+            message = _usage_message(error, context).replace("Value error, ", "").rstrip(".")
             if message:  # empty if the help was printed instead
                 stop = "" if message.endswith(("?", "!")) else "."
                 failure(f"{message}{stop} See `{command} --help`.")
@@ -385,19 +389,50 @@ class CommandGroup(TyperGroup):
             raise typer.Exit(130) from None
 
 
-def _show_literally(command: Any) -> None:
-    """Make the help of a command and of all in it show as it is written, in paragraphs."""
+_MOST_OPTIONS = 10  # of a command, with --help, before those in the panel "Advanced"
+
+
+def _arrange_help(command: Any) -> None:
+    """Make the help of a command and of all in it show as it is written, in paragraphs.
+
+    Options are declared by importance: those after the first are in a panel of their own.
+    """
     for each in (command, *command.params):
         if getattr(each, "help", None):
             each.help = escape(_in_paragraphs(inspect.cleandoc(each.help)))
+    options = [each for each in command.params if each.opts[0].startswith("-") and not each.hidden]
+    for option in options[_MOST_OPTIONS - 1 :]:
+        option.rich_help_panel = "Advanced"
     for child in getattr(command, "commands", {}).values():
-        _show_literally(child)
+        _arrange_help(child)
 
 
 def _in_paragraphs(text: str) -> str:
     """Text with one line per paragraph; indented lines, the examples, stay lines of their own."""
     joined = re.sub(r"(?<!\n)\n(?![\n ])", " ", text)
     return re.sub(r"(?m)^( .*)\n\n(?= )", r"\1\n", joined)
+
+
+def _usage_message(error: Any, context: Any) -> str:
+    """Click's message; of an unknown option, the near ones, and --set if the command has it."""
+    unknown = getattr(error, "option_name", "")
+    if type(error).__name__ != "NoSuchOption" or context is None:
+        return str(error.format_message())
+    known = [name for parameter in context.command.params for name in parameter.opts]
+    near = did_you_mean(unknown, [name for name in known if name.startswith("--")])
+    field = unknown.lstrip("-").replace("-", "_")
+    if not near and "--set" in known:
+        near = f" Fields and hyperparameters are set by name: --set {field}=VALUE."
+    return f"No such option: {unknown}.{near}"
+
+
+def count(text: str) -> int:
+    """The parser of options that count: `20000`, `20_000`, `2e4`."""
+    with contextlib.suppress(ValueError):
+        number = float(text)
+        if number.is_integer():
+            return int(number)
+    raise typer.BadParameter(f"{text!r}: must be an integer, such as 20000 or 2e4")
 
 
 def _show_version(context: typer.Context, wanted: bool) -> None:

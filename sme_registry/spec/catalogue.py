@@ -223,6 +223,12 @@ def _check_is_file(kind: type[Envelope], data: dict[str, Any], source: str, reme
     """Say that data is a bare document, or the file of another kind, not which fields it lacks."""
     document: Any = kind.model_fields[kind.content].annotation
     is_bare = data.keys() <= document.model_fields.keys()
+    if f"{kind.content}_digest" in data:
+        raise MalformedDocumentError(
+            f"{source}: is a report, or the record of a run, on the {_word(kind)} "
+            f"{data[f'{kind.content}_digest']!r:.90}. Give the file or the name of the "
+            f"{_word(kind)} itself."
+        )
     if "digest" not in data and (is_bare or kind.content in data):
         raise MalformedDocumentError(
             f"{source}: {'is a bare ' + kind.content + ': ' if is_bare else ''}digest: missing: "
@@ -230,9 +236,12 @@ def _check_is_file(kind: type[Envelope], data: dict[str, Any], source: str, reme
         )
     others = [other for other in Envelope.__subclasses__() if other.content in data]
     if others and kind.content not in data:
-        words = {"spec": "task", "plan": "study plan"}
-        actual, expected = (words.get(one.content, one.content) for one in (others[0], kind))
-        raise SpecError(f"{source}: is the file of a {actual}, not of a {expected}.")
+        raise SpecError(f"{source}: is the file of a {_word(others[0])}, not of a {_word(kind)}.")
+
+
+def _word(kind: type[Envelope]) -> str:
+    """What people call a kind."""
+    return {"spec": "task", "plan": "study plan"}.get(kind.content, kind.content)
 
 
 NAMESPACE = "SME"
@@ -294,11 +303,34 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     """The file of a name, with or without its version (then the newest)."""
     if newest := _newest(kind, name):
         return cast(_E, _read(kind, spec_folder() / kind.folder / f"{newest}.json"))
+    if Path(name).suffix in POLICY_SUFFIXES:
+        raise UnknownNameError(
+            f"{name!r}: is the file of a policy, not of a {_word(kind)}. To evaluate it: "
+            f"sme evaluate {name} TASK."
+        )
+    for other in Envelope.__subclasses__():
+        if _newest(other, name):
+            raise UnknownNameError(
+                f"{name!r}: is the name of a {_word(other)}, not of a {_word(kind)}. "
+                + _USES.get((other.content, kind.content), "See `sme show {0}`.").format(name)
+            )
     known = [*names(kind), *others]
     near = did_you_mean(name, known)
     near = near or did_you_mean(name, [_VERSION.sub("", full) for full in known])
-    message = f"{name!r}: no {kind.content} has this name.{near} `sme list` shows the names."
+    message = f"{name!r}: no {_word(kind)} has this name.{near} `sme list` shows the names."
     raise UnknownNameError(message)
+
+
+POLICY_SUFFIXES = (".zip", ".onnx", ".npz", ".pt", ".pth")
+_USES = {  # of a name of one kind where another is wanted
+    (
+        "suite",
+        "spec",
+    ): "To train on all of its tasks: sme train --suite {0}; for one of them, give "
+    "its digest from `sme show {0}`.",
+    ("spec", "suite"): "To train on it alone: sme train {0}, without --suite. In a suite of your "
+    "own: sme new suite.json -t {0}.",
+}
 
 
 def _newest(kind: type[Envelope], name: str) -> str:

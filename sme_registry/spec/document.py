@@ -76,6 +76,8 @@ def _explain(model: type[BaseModel], line: ErrorDetails) -> str:
     fields = _fields_at(model, location[:-1])
     if kind == "missing":
         return f"{path}: missing. Add it."
+    if location[-1:] == ("schema_version",) and str(line["input"]).isdecimal():
+        return f"{value}: a newer version wrote it. Upgrade: pip install --upgrade sme-registry."
     if kind == "extra_forbidden":
         near = did_you_mean(str(location[-1])[:120], fields)
         known = f" Known fields: {', '.join(fields)}." if fields else ""

@@ -198,7 +198,12 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     """Measure a drawn task. The same task and seed give the same certificate.
 
     `seed`, in [0, 2⁵³), is that of the states and actions to measure with. Where the certificate
-    has not `passed`, the task should not be used.
+    has not `passed`, the task should not be used. In a notebook it shows as a card.
+
+    Examples:
+      >>> from sme_registry.task import certify
+      >>> certify("Default").passed
+      True
     """
     seed = integer_in("seed", seed, 0, 2**53 - 1, advice="Leave it out for 0.")
     if not isinstance(task, Task):

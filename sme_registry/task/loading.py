@@ -7,6 +7,7 @@ refused, as is one too large for the memory, before it is drawn.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 from collections.abc import Iterator, Sequence
@@ -15,7 +16,8 @@ from typing import Any, TypeVar, overload
 
 import numpy as np
 
-from sme_registry.errors import FingerprintMismatchError, OptionError, ResourceLimitError
+from sme_registry.errors import FingerprintMismatchError, OptionError, ResourceLimitError, SMEError
+from sme_registry.io import check_new
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import Fingerprint, as_document, file_of, resolve
 from sme_registry.spec.document import NamedDocument
@@ -86,11 +88,12 @@ def save(
     *,
     description: str = "",
     tags: tuple[str, ...] = (),
+    force: bool = False,
 ) -> Path:
     """Write a spec or a stream as a file that a colleague can `load`, with digest and fingerprint.
 
-    The name is of letters, digits, '_' and '-', by default the file's without its ending. A file
-    that exists is replaced, completely or not at all.
+    The name is of letters, digits, '_' and '-', by default the file's without its ending. Only
+    `force` replaces a file of another document.
 
     Examples:
       >>> spec = sme_registry.SMESpec(state_dim=16, complexity=10, seed=7)
@@ -99,6 +102,9 @@ def save(
       True
     """
     document = as_document(spec)
+    with contextlib.suppress(SMEError):
+        force = force or resolve(Path(path)).document == document
+    check_new(path, force=force)
     fingerprints = [fingerprint_of(task) for task in materialize_together(document.specs)]
     file = file_of(
         document,

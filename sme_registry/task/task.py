@@ -119,6 +119,9 @@ class Task:
     distractor_transition: tuple[Array, Array] | None = None
     mixing: tuple[Layer, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<Task of {self.spec!r}>"
+
     @property
     def arrays(self) -> Iterator[Array]:
         yield from (self.W, self.b, *(self.distractor_transition or ()))

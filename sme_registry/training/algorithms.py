@@ -30,6 +30,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, create_model
+from rich.console import Console
+from rich.markup import escape
 
 from sme_registry.datasets import documents
 from sme_registry.envs.arguments import check_has_limits
@@ -426,6 +428,17 @@ def is_sb3(algorithm: Any) -> bool:
 def quiet() -> contextlib.AbstractContextManager[Any]:
     """Hide warnings of libraries, which address their developers and not our users."""
     return warnings.catch_warnings(action="ignore")
+
+
+@contextlib.contextmanager
+def show_advice(console: Console) -> Iterator[None]:
+    """Print once what Stable-Baselines3 warns of hyperparameters, such as a truncated minibatch."""
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        yield
+    advice = [each for each in caught if "stable_baselines3" in each.filename]
+    for text in dict.fromkeys(str(each.message) for each in advice if each.category is UserWarning):
+        message = " ".join(text.split())
+        console.print(f"[yellow]note:[/] {escape(message)}", soft_wrap=True)
 
 
 @contextlib.contextmanager

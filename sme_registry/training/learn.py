@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
 from sme_registry.envs.episodes import Episode, Episodes
 from sme_registry.errors import PolicyError
@@ -179,6 +180,13 @@ class RunLog(Watch):
         self._agents = () if team is None else tuple(agent.name for agent in team.agents)
         self._learner, self._record, self._folder = learner, record, folder
         self._log = EpisodeLog(folder / EPISODES, first_step, self._agents)
+        lost = record.episodes - len(self.episodes) if first_step else 0
+        if lost > 0:
+            (console or err()).print(
+                f"{escape(str(folder / EPISODES))}: was cut off or changed: {lost:,} of the "
+                f"{record.episodes:,} episodes before the checkpoint are missing from the log.",
+                soft_wrap=True,
+            )
         self._wall_before = self.episodes[-1].wall_seconds if self.episodes else 0.0
         self._last_checkpoint = first_step
         self._sums = Episodes(

@@ -172,6 +172,7 @@ class RunRecord(StrictModel):
             hyperparameters=previous.hyperparameters,
             sessions=previous.sessions + 1,
             steps_done=previous.steps_done,
+            episodes=previous.episodes,
         )
 
 

@@ -45,7 +45,7 @@ from sme_registry.io import (
     is_installed,
     is_locked,
 )
-from sme_registry.io.terminal import Progress
+from sme_registry.io.terminal import Progress, err
 from sme_registry.plots import reports as plot_files
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec, catalogue
@@ -67,6 +67,7 @@ from sme_registry.training.algorithms import (
     nested_hyperparameters,
     quiet,
     short_name,
+    show_advice,
 )
 from sme_registry.training.functions import source_of
 from sme_registry.training.learn import Run, learn
@@ -86,7 +87,7 @@ from sme_registry.training.record import (
 
 EVALUATION = "evaluation.json"
 REPORT = "report.md"  # written by `sme demo`
-EXPLORER = "explorer.html"  # written by `sme train` and `sme explore`
+EXPLORER = "explorer.html"  # written by `sme train` and `sme diagnose --explore`
 _FILES = (
     RECORD, EPISODES, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, EVALUATION, STREAM, *plot_files.FILES,
     REPORT, EXPLORER, TENSORBOARD,
@@ -240,7 +241,8 @@ def train(
             piece=min(100, record.checkpoint_every),
             field="algorithm",
         )
-        learner = entry.learner(run)  # rejects hyperparameters before the folder is created
+        with show_advice(console or err()):
+            learner = entry.learner(run)  # rejects hyperparameters before the folder is created
         record = record.updated(hyperparameters=learner.hyperparameters)
         if record.sessions == 1:
             claim_folder(folder, _FILES if force else (), force=force)

@@ -1,13 +1,11 @@
-"""The command `sme dataset`."""
+"""The command `sme data`."""
 
 import json
 import shutil
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from sme_registry.cli import app
 from sme_registry.datasets import open_dataset
 from tests import commands
 
@@ -15,11 +13,11 @@ NAME = "sme/Default-v1-nu50-seed7-v0"
 
 
 def good(*arguments):
-    return commands.good("dataset", *arguments)
+    return commands.good("data", *arguments)
 
 
 def refused(*arguments):
-    return " ".join(commands.refused("dataset", *arguments).split())
+    return " ".join(commands.refused("data", *arguments).split())
 
 
 @pytest.fixture(autouse=True)
@@ -39,7 +37,7 @@ def test_make_list_show_and_validate():
     stdout = good("show", NAME).stdout
     assert "300 in 3 trajectories" in stdout
     assert open_dataset(NAME).record.arrays_digest in stdout
-    assert "valid" in good("validate", NAME).stdout
+    assert "valid" in good("check", NAME).stdout
 
 
 def test_json_prints_only_the_record():
@@ -50,7 +48,7 @@ def test_json_prints_only_the_record():
     assert made["scores"]["optimum"]["rollouts"]["mean_return"] == 100.0
     assert json.loads(good("show", NAME, "--json").stdout) == made
     assert json.loads(good("list", "--json").stdout) == [made]
-    assert json.loads(good("validate", NAME, "--json").stdout)[0]["valid"] is True
+    assert json.loads(good("check", NAME, "--json").stdout)[0]["valid"] is True
 
 
 def test_make_accepts_a_mix_a_field_a_name_and_a_folder():
@@ -61,7 +59,7 @@ def test_make_accepts_a_mix_a_field_a_name_and_a_folder():
     assert recipe.shares == (28, 12)
     assert recipe.spec.complexity == 2
     assert recipe.coverage == -0.05
-    assert "sets/me/mixed-v1" in good("validate", "sets/me/mixed-v1").stdout
+    assert "sets/me/mixed-v1" in good("check", "sets/me/mixed-v1").stdout
     assert "no data sets" in good("list").stderr
 
 
@@ -84,7 +82,7 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
              "--name", f"sme/{suffix}-v0")  # fmt: skip
         sets[suffix] = open_dataset(f"sme/{suffix}-v0")
     for suffix, made in sets.items():
-        assert "valid" in good("validate", f"sme/{suffix}-v0").stdout
+        assert "valid" in good("check", f"sme/{suffix}-v0").stdout
         (behaviour,) = made.recipe.behaviours
         assert behaviour.policy == "mine"
         assert behaviour.sha256 == sha256_of((tmp_path / f"mine.{suffix}").read_bytes())
@@ -137,12 +135,9 @@ def test_a_copy_under_another_name_is_neither_listed_nor_valid(tmp_path):
     assert f"sme/Copy-v0: contains the data set {own}. Move or copy it back to {back}, or" in stderr
     assert [found["id"] for found in json.loads(good("list", "--json").stdout)] == [own]
     for name in ("sme/Copy-v0", "minari/sme/Copy-v0"):
-        assert (
-            f"Copy-v0: contains the data set {own}"
-            in commands.sme("dataset", "validate", name).stdout
-        )
+        assert f"Copy-v0: contains the data set {own}" in commands.sme("data", "check", name).stdout
     shutil.copytree(tmp_path / "minari" / own, tmp_path / "backup" / own)
-    good("validate", own, f"minari/{own}", f"backup/{own}")
+    good("check", own, f"minari/{own}", f"backup/{own}")
 
 
 def test_broken_data_sets_are_named_and_the_others_are_listed_and_checked(tmp_path):
@@ -152,9 +147,7 @@ def test_broken_data_sets_are_named_and_the_others_are_listed_and_checked(tmp_pa
         good("make", "Default", "-n", "50", "--name", name)
     with h5py.File(tmp_path / "minari/sme/bad-v0/data/main_data.hdf5", "r+") as file:
         file["episode_0/rewards"][0] = 1.0
-    result = commands.sme(
-        "dataset", "validate", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json"
-    )
+    result = commands.sme("data", "check", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json")
     assert result.exit_code == 2
     assert [checked["valid"] for checked in json.loads(result.stdout)] == [False, True, False]
     (tmp_path / "minari/sme/bad-v0/data/metadata.json").write_text("{")
@@ -165,10 +158,9 @@ def test_broken_data_sets_are_named_and_the_others_are_listed_and_checked(tmp_pa
     assert "bad-v0" in result.stderr
 
 
-@pytest.mark.parametrize("command", ["list", "show", "validate"])
-def test_readers_name_the_folder_of_data_sets_as_offline_train_does(command):
+@pytest.mark.parametrize("command", ["list", "show", "check"])
+def test_readers_name_the_folder_of_data_sets(command):
     assert "--datasets" in good(command, "--help").stdout
-    assert "--datasets" in CliRunner().invoke(app, ["offline", "train", "--help"]).stdout
     name = () if command == "list" else (NAME,)
     assert "--out" in refused(command, *name, "--out", "data")
     good("make", "Default", "-n", "50", "--seed", "7", "--out", "data")

@@ -232,7 +232,7 @@ def test_without_torch_it_says_what_to_install(transitions, monkeypatch):
         short(transitions)
 
 
-SHORT = ["--steps", "5", "--batch-size", "16", "--evaluations", "1", "--set", "hidden=[8]"]
+SHORT = ["--steps", "5", "--set", "batch_size=16", "--set", "hidden=[8]"]
 
 
 @pytest.fixture(scope="module")
@@ -246,9 +246,10 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.parametrize("algorithm", ["bc", "iql"])
-def test_train_and_evaluate_from_the_command_line(folder, tmp_path, algorithm):
+def test_train_and_evaluate_from_the_command_line(folder, tmp_path, algorithm, monkeypatch):
     out, task = tmp_path / "run", tmp_path / "tiny.json"
-    named = ("offline", "train", "tiny-v0", "-a", algorithm, "--datasets", folder)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
+    named = ("train", "--data", "tiny-v0", "-a", algorithm)
     assert "improvement" in good(*named, "--out", out, *SHORT).stdout
     names = {path.name for path in out.iterdir()}
     assert names >= {"offline.json", "policy.npz", "evaluation.json"}
@@ -259,7 +260,7 @@ def test_train_and_evaluate_from_the_command_line(folder, tmp_path, algorithm):
 
 def test_json_is_the_record_and_the_report(folder, tmp_path):
     shown = good(
-        "offline", "train", folder / "tiny-v0", "-a", "bc", "--json", "--out", tmp_path / "run",
+        "train", "--data", folder / "tiny-v0", "-a", "bc", "--json", "--out", tmp_path / "run",
         *SHORT,
     )  # fmt: skip
     output = json.loads(shown.stdout)
@@ -276,11 +277,15 @@ def test_json_is_the_record_and_the_report(folder, tmp_path):
         (["tiny-v0", "--steps", "0"], "steps=0"),
         (["tiny-v0", "--set", "expectil=1"], "unknown field"),
         (["tiny-v0", "--protocol", "nothing"], "nothing"),
+        (["tiny-v0", "--resume"], "--resume: is not for --data"),
     ],
 )
-def test_invalid_input_is_refused_and_writes_nothing(folder, tmp_path, arguments, message):
+def test_invalid_input_is_refused_and_writes_nothing(
+    folder, tmp_path, arguments, message, monkeypatch
+):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
     out = tmp_path / "run"
-    assert message in refused("offline", "train", *arguments, "--datasets", folder, "--out", out)
+    assert message in refused("train", "--data", *arguments, "--out", out)
     assert not out.exists()
 
 
@@ -327,7 +332,7 @@ def test_the_progress_is_reported_of_all_steps_and_faults_are_named(sealed):
 
 def test_the_command_writes_a_policy(sealed, tmp_path):
     folder, target = sealed.write("sealed/autumn/deep-0-v0", tmp_path), tmp_path / "deep-0.npz"
-    command = ["offline", "sealed", folder, "-o", target, "-n", "20", "--batch-size", "32"]
+    command = ["train", "--data", folder, "-o", target, "-n", "20", "--set", "batch_size=32"]
     good(*command, "--set", "hidden=[16]")
     policy, expected = OfflinePolicy.load(target), train_sealed(sealed, **BRIEF)
     np.testing.assert_array_equal(

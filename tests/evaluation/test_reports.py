@@ -14,6 +14,7 @@ from rich.console import Console
 from sme_registry import EvaluationReport, SMESpec, evaluate, plots
 from sme_registry.errors import DigestMismatchError, MissingDependencyError, SpecError
 from sme_registry.evaluation import references, regions
+from sme_registry.evaluation.report import as_text
 from sme_registry.spec import EvaluationProtocol
 from tests.evaluation.kinds import (
     DISTRACTORS,
@@ -169,7 +170,8 @@ def test_a_stored_report_may_have_references_of_another_version():
         scores["earlier_name"] = scores.pop("shrunk_optimal")
         del scores[references.NAMES[-1]]  # younger than the report
     report = EvaluationReport.from_dict(document)
-    shown = str(report)
+    assert "similarity" in str(report)
+    shown = everything(report)
     assert shown.count("earlier_name") == 6  # two of errors, four of safety
     assert plots.reward_against_cost(report)
 
@@ -265,6 +267,10 @@ def rendered(report):
     return console.file.getvalue()
 
 
+def everything(report):
+    return "\n".join(map(as_text, report.tables(details=True)))
+
+
 def test_the_table_fits_80_columns_and_shows_references_beside_the_policy(report):
     text = rendered(report)
     assert "…" not in text
@@ -290,13 +296,16 @@ def test_the_table_of_a_team_has_three_lines_for_each_agent():
 
 
 def test_tables_show_safety_and_distractors():
-    safe, text = report_of("safe"), str(report_of("safe"))
+    safe, text = report_of("safe"), everything(report_of("safe"))
     for heading in ("cost", "violating share", "safe regret", "price of safety", "safe projection"):
         assert heading in text
     assert f"{safe.safety.regions[0].safe_regret:.3f}" in text
-    text = str(report_of("distracted"))
+    text = everything(report_of("distracted"))
     assert f"{DISTRACTORS} distractors" in text
     assert "sensitivity" in text
+    assert "\ncost" in str(safe)
+    assert "sensitivity" in str(report_of("distracted"))
+    assert "safe regret" not in str(safe)
 
 
 @pytest.mark.parametrize("spec", [SMESpec(), SMESpec(seed=12345)])
@@ -312,7 +321,7 @@ def test_a_notebook_shows_a_reports_table_and_a_line_elsewhere(report):
     assert f"WD regret {report.wd_regret:.3f}" in repr(report)
     html = report._repr_html_()
     rows = html.split("<tr")[1:]
-    assert len(rows) == 1 + sum(row is not None for row in report.table().rows)
+    assert len(rows) == 1 + sum(row is not None for row in report.tables()[0].rows)
     assert all(row.count("</td>") == 7 for row in rows[1:])
     assert f"{report.regions[5].normalised_regret:.3f}" in html
     escaped = report.model_copy(update={"policy": "<b>[bold]"})._repr_html_()

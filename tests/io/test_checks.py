@@ -32,10 +32,11 @@ def test_an_integer_or_a_number_in_its_range_comes_back_as_pythons():
     ],
 )
 def test_any_other_value_is_refused_with_name_value_and_range(check, low, high, allowed, values):
-    for value in (*values, True, np.bool_(1), "3", None):
+    for value in (*values, True, np.bool_(1), np.float64(-1.7), "3", None):
         with pytest.raises(OptionError) as caught:
             check("x", value, low, high)
-        assert str(caught.value) == f"x={value!r}: must be {allowed}."
+        shown = value.item() if isinstance(value, np.generic) else value
+        assert str(caught.value) == f"x={shown!r}: must be {allowed}."
     with pytest.raises(OptionError, match=r"^seed=-1: must be an integer of at least 0\. Leave"):
         integer_in("seed", -1, 0, advice="Leave it out.")
 

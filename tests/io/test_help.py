@@ -47,6 +47,16 @@ def test_help_shows_its_source_unchanged(program: str, path: tuple[str, ...], co
             assert f" {word} " in shown  # a longer word would be cut: use a shorter one
 
 
+@pytest.mark.parametrize(("program", "path", "command"), COMMANDS)
+def test_help_shows_ten_options_at_most_below_a_few_lines(program, path, command):
+    result = CliRunner().invoke(APPS[program], [*path, "--help"], env={"COLUMNS": "80"})
+    above, *panels = re.split("(?=╭─ )", result.stdout)
+    (options,) = (panel for panel in panels if panel.startswith("╭─ Options"))
+    assert len(re.findall(r"^│ [ *]{0,3}--?[a-z]", options, re.M)) <= 10
+    prose = above.split("Examples:")[0] if program == "sme-leaderboard" else above
+    assert sum(bool(line.strip()) for line in prose.splitlines()[2:]) <= 15
+
+
 def test_examples_are_lines_without_empty_ones_between_and_a_suggestion_has_one_mark():
     lines = CliRunner().invoke(sme, ["list", "--help"], env={"COLUMNS": "80"}).stdout.splitlines()
     start = lines.index(next(line for line in lines if line.strip() == "Examples:"))

@@ -38,7 +38,7 @@ def refused(*arguments):
 
 
 def new_suite(*others):
-    good("suite", "new", "lives.json", "-t", "mine.json", "--instances", "3", *others)
+    good("new", "lives.json", "-t", "mine.json", "--instances", "3", *others)
     return SuiteFile.read("lives.json").suite
 
 
@@ -61,14 +61,12 @@ def test_a_suite_has_a_class_for_a_stream_beside_tasks():
     assert suite.stream_instances == tuple(STREAM.draw(number) for number in range(3))
     assert [member.name for member in suite.classes] == ["Default"]
     assert suite.runs == {"Default": 3, "mine": 3}
-    wider = commands.good("suite", "new", "wider.json", "--suite", "lives.json", "-t", "Switch5")
+    wider = commands.good("new", "wider.json", "--suite", "lives.json", "-t", "Switch5")
     assert "3 classes, 7 instances" in wider.stderr
     members = SuiteFile.read("wider.json").suite.streams
     assert [member.name for member in members] == ["mine", "Switch5"]
-    good("validate", "lives.json", "wider.json")
-    assert "appears twice" in refused(
-        "suite", "new", "x.json", "-t", "mine.json", "-t", "mine.json"
-    )
+    good("check", "lives.json", "wider.json", "--files-only")
+    assert "appears twice" in refused("new", "x.json", "-t", "mine.json", "-t", "mine.json")
 
 
 def test_a_suite_of_streams_is_shown_with_names_to_train_by():
@@ -92,7 +90,7 @@ def test_a_suite_of_streams_is_shown_with_names_to_train_by():
 def test_every_task_and_every_phase_of_every_draw_is_certified():
     save(TASK, "task.json")
     new_suite("-t", "task.json")
-    certified = json.loads(good("certify", "lives.json", "--json"))
+    certified = json.loads(good("check", "lives.json", "--json"))[0]["certificates"]
     phases = [f"lives/mine draw {draw} phase {phase}" for draw in range(3) for phase in (0, 1)]
     tasks = [f"lives/task seed {seed}" for seed in range(3)]
     assert [entry["task"] for entry in certified] == tasks + phases

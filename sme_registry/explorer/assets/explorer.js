@@ -384,7 +384,7 @@ function refreshControls() {
   $("notice").textContent = sampled
     ? `The network of ${policy.name} is not one that this page can compute${policy.recurrent ? " (it is recurrent: its actions are those of its first step)" : ""}. `
       + `Its actions were sampled over ${policy.grids.map((g) => g.axes.map((i) => inputs[i].name).join(" and ")).join("; ")}, so the other sliders are off. `
-      + "`sme explore --channels` samples other channels."
+      + "`sme diagnose --explore --channels` samples other channels."
     : "";
 }
 
