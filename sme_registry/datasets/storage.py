@@ -9,6 +9,7 @@ data set has the columns that an agent sees, and no record.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -68,6 +69,7 @@ from sme_registry.task.task import Array, Mask, Observation
 
 _SEALED = "sealed/"  # begins the id of a season's data set
 _NAMESPACE = "namespace_metadata.json"
+_SHA256 = "sme_sha256"  # in the metadata: of the file of arrays; data sets of before have none
 _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "h5py", "minari")
 
@@ -102,6 +104,13 @@ class Dataset:
                 f"be {self.record.arrays_digest[:19]}…, as generated. They were changed or "
                 "extended. Download the data set again, generate it again (--force), or read it "
                 "with Minari, which does not check digests."
+            )
+        data = self.path / "data" / DATA
+        written = _read_metadata(self.path).get(_SHA256)
+        if written is not None and written != hashlib.sha256(data.read_bytes()).hexdigest():
+            raise DigestMismatchError(
+                f"{data}: other bytes than were written, though its arrays are the same. Download "
+                "the data set again, or generate it again (--force)."
             )
         return transitions
 
@@ -323,6 +332,7 @@ def _write(
     metadata = metadata_of(dataset_id, columns, len(content))
     if record is not None:
         metadata |= about_task(record)
+        metadata[_SHA256] = hashlib.sha256(content).hexdigest()
     with build_folder(target, force=force) as building:
         for namespace in target.relative_to(root).parents[:-1]:
             path = root / namespace / _NAMESPACE  # by which Minari recognises it

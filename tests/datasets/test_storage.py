@@ -380,6 +380,12 @@ class TestAChangedSet:
         with pytest.raises(MalformedDocumentError, match="last row of regret"):
             open_dataset(NAME, copied).transitions()
 
+    def test_with_a_flipped_bit_that_changes_no_array_is_rejected(self, copied):
+        path = copied / NAME / "data" / "main_data.hdf5"
+        path.write_bytes(path.read_bytes() + b"\0")
+        with pytest.raises(DigestMismatchError, match="other bytes than were written"):
+            open_dataset(NAME, copied).transitions()
+
     @pytest.mark.parametrize("content", ["", "[]", '{"a": '])
     def test_with_a_broken_namespace_is_listed_as_broken(self, content, copied):
         (copied / "sme" / "namespace_metadata.json").write_text(content)
