@@ -35,12 +35,6 @@ def test_a_public_name_can_be_imported_and_is_documented():
         assert name in dir(sme_registry)
 
 
-def test_star_import_gives_the_public_names():
-    namespace = {}
-    exec("from sme_registry import *", namespace)
-    assert set(sme_registry.__all__) <= namespace.keys()
-
-
 SUBMODULES = [
     "datasets", "diagnosis", "envs", "errors", "evaluation", "plots", "sb3", "seasons", "spec",
     "statistics", "studies", "task", "teams", "testing", "training",
@@ -141,15 +135,3 @@ class TestRegister:
         with pytest.raises(SpecError, match="must be an SMESpec or a mapping"):
             sme_registry.register("Default", "ApiBad")
         assert "SME/ApiBad-v1" not in gymnasium.registry
-
-
-def test_a_task_sent_as_a_file_is_the_same_task_at_the_other_end(tmp_path):
-    mine = SMESpec(state_dim=5, complexity=4, seed="0xfeed")
-    theirs = sme_registry.load(sme_registry.save(mine, tmp_path / "sub" / "ours-v1.json"))
-    assert theirs.digest == mine.digest
-    s = [0.1, 0.2, 0.3, 0.4, 0.5]
-    a = sme_registry.materialize(mine).optimal_action(s)
-    assert sme_registry.materialize(theirs).regret(s, a) == 0.0
-    from sme_registry.spec import EnvFile
-
-    assert EnvFile.read(tmp_path / "sub" / "ours-v1.json").name == "ours"

@@ -70,23 +70,6 @@ def test_a_batch_runs_on_over_episodes_within_a_common_wrapper(name):
     assert ends == 6
 
 
-def test_recorded_statistics_of_a_batch_are_those_of_its_singles():
-    batch = vector_wrappers.RecordEpisodeStatistics(
-        sme_registry.make_vec("Default", 2, horizon=T, autoreset_mode="SameStep")
-    )
-    batch.reset(seed=5)
-    single = wrappers.RecordEpisodeStatistics(sme_registry.make("Default", horizon=T))
-    single.reset(seed=6)
-    action, earned = np.full((2, 4), 0.25, np.float32), 0.0
-    for _ in range(T):
-        _, _, _, _, infos = batch.step(action)
-        _, _, _, _, info = single.step(action[0])
-        earned += info["step_reward"]
-    assert infos["episode"]["r"][1] == pytest.approx(info["episode"]["r"], abs=1e-6)
-    assert info["episode"]["r"] == pytest.approx(earned, abs=1e-9)
-    assert infos["episode"]["l"].tolist() == [T, T]
-
-
 @pytest.mark.parametrize("outside", [None, wrappers.Autoreset, wrappers.RecordEpisodeStatistics])
 def test_a_time_limit_below_the_horizon_truncates_and_pays(outside):
     made = gymnasium.make("SME/Default-v1", horizon=T, k=T, max_episode_steps=3)
