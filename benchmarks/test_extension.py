@@ -1,4 +1,4 @@
-"""What `safety` and `observation` cost a step, compared with the same task without them."""
+"""What `shaping`, `safety` and `observation` cost a step, compared with the task without them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from sme_registry import SMESpec
 
 # A ratio is the plain step's time over the extended one's.
 EXTENSIONS: dict[str, tuple[dict[str, Any], float]] = {
+    "shaping": ({"shaping": {"scale": 3.0}}, 1 / 1.3),
     "safety": ({"safety": {"tightness": 0.2}}, 1 / 2),
     "32 distractors, nonlinear": (
         {"observation": {"distractors": 32, "mixing": "nonlinear"}},

@@ -181,11 +181,12 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
 
     def _allocate(self) -> None:
-        """The joint action `[1, A]`, a step's values `[5, n]`, and each agent's views of them."""
+        """The joint action `[1, A]`, the values of a step, and each agent's views of both."""
         # Views of no dimension make NumPy's numbers in a third of the time of any other way.
         task, columns = self.task, self._schedule.columns
         self._joint_action = np.zeros((1, task.spec.action_dim))
         self._values = np.zeros((columns.rows, len(task.names)))
+        self._more = tuple(columns.numbers)[4:]
         agents = list(enumerate(zip(task.names, task.owned, strict=True)))
         self._slots = [(name, self._joint_action[0, owned]) for _, (name, owned) in agents]
         self._numbers: list[tuple[Any, ...]] = [
@@ -218,6 +219,11 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
     def state(self) -> Array:
         """The state s, `[S]` float64 in [0, 1] (a copy), unobserved channels included."""
         return cast(Array, self._batch.state[0])
+
+    @property
+    def noise(self) -> Array:
+        """ξ of each agent and ζ of the next step, `[1, n + S]`."""
+        return self._batch.noise
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -287,7 +293,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
     def _infos(self, optimal: Array) -> dict[str, dict[str, Any]]:
         """Each agent's info of the last step, from its joint optimal action `[A]`."""
         optimal = arguments.from_unit(optimal, self._rescaled)
-        return {
+        infos: dict[str, dict[str, Any]] = {
             name: {
                 "optimal_action": optimal[owned],
                 "similarity": similarity[()],
@@ -295,8 +301,13 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
                 "regret": regret[()],
                 "accumulated_reward": accumulated_reward[()],
             }
-            for name, owned, similarity, step_reward, regret, accumulated_reward in self._numbers
+            for name, owned, similarity, step_reward, regret, accumulated_reward, *_ in (
+                self._numbers
+            )
         }
+        for name, _, *values in self._numbers if self._more else ():
+            infos[name] |= {k: v[()] for k, v in zip(self._more, values[4:], strict=True)}
+        return infos
 
     def _by_agent(self, observation: Observation) -> dict[str, Observation]:
         """Each agent's part of the joint observation, in fresh arrays."""

@@ -31,7 +31,7 @@ from sme_registry.spec.sme_spec import ACTION_RANGES, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task, load, materialize, observe, step
 from sme_registry.task.loading import materialize_segments
-from sme_registry.task.task import NUMBERS, Array, Step
+from sme_registry.task.task import NUMBERS, ON_TOP, Array, Step, shaping_at_switch
 from sme_registry.teams import SMETeamEnv, observed_columns
 
 __all__ = ["ConformanceError", "check_env", "check_stream", "check_team"]
@@ -189,6 +189,7 @@ class _Life:
     def __init__(self, env: Any, schedule: Schedule, seed: int) -> None:
         self.agents, self.env, self.schedule = _Agents(env), env, schedule
         self.rng, self.lifetime, self.segment = np.random.default_rng(seed), 0, 0
+        self.at_switch = 0.0  # what a switch added to the last step's shaping
         self.written: list[npt.NDArray[Any]] = []
         episode_seed: int | None = seed
         while self.lifetime < _steps(schedule):
@@ -219,17 +220,22 @@ class _Life:
         task, s, d = self.task, self.agents.state, getattr(self.env, "distractors", _NONE)
         action = next_action(self.env, self.rng)
         unit = self.agents.unit(action)
-        result = step(task, s[None], np.array([self.t]), self.r_cum, unit[None])
+        noise = self.env.noise if task.spec.noise is not None else None
+        noise = None if noise is None else np.atleast_2d(noise)
+        result = step(task, s[None], np.array([self.t]), self.r_cum, unit[None], noise)
         returned = self.agents.by_agent(self.env.step(action))
         self.lifetime, self.t = self.lifetime + 1, self.t + 1
         expect_equal("the next state", self.agents.state, result.state[0])
+        within = self.schedule.switches_within
+        later = self.schedule.segment(self.lifetime) if within else self.segment
+        after = self.schedule.tasks[later]
+        self.at_switch = shaping_at_switch(task, after, self.agents.state, self.t)
         for agent, name in enumerate(self.agents.names):
             self._check_agent(agent, result, *(part[name] for part in returned[1:]))
         observations, info, ended = returned[0], returned[4], has_ended(returned)
         if task.spec.dynamics == "driven":
             expect_equal("distractors", self.env.distractors, task.distractor_step(d, unit))
-        if self.schedule.switches_within:
-            self.segment = self.schedule.segment(self.lifetime)
+        self.segment = later
         expect_equal("the task in force", self.env.sme_spec, self.task.spec)
         self.r_cum = np.array([[one["accumulated_reward"] for one in info.values()]])
         self._check_observations("observation", observations)
@@ -270,6 +276,8 @@ class _Life:
         for key, value in {"reward": reward, **info}.items():
             if key in NUMBERS:
                 number = getattr(result, key)[0, agent]
+                if key in ("reward", "shaping") and not (terminated or truncated):
+                    number = number + self.at_switch
                 expect_near(f"{where}the {key}", value, number, tolerances.get(key, TOLERANCE))
         expect_equal(f"{where}terminated", terminated, bool(result.terminated[0]))
         expect_equal(f"{where}truncated", truncated, bool(result.truncated[0]))
@@ -286,8 +294,9 @@ class _Life:
             if not ((value >= low) & (value <= 1.0)).all():
                 raise ConformanceError(f"{where}{key}={value}: outside the action range.")
         for key in numbers:
-            bottom = -1.0 if key == "safe_regret" else 0.0
-            top = np.inf if key == "accumulated_reward" else 1.0
+            paid = key in ("shaping", "reward_noise")
+            bottom = -np.inf if paid else -1.0 if key == "safe_regret" else 0.0
+            top = np.inf if paid or key == "accumulated_reward" else 1.0
             if not (isinstance(info[key], np.float64) and bottom <= info[key] <= top):
                 raise ConformanceError(
                     f"{where}{key}={info[key]!r}: must be a float64 in [{bottom}, {top}]."
@@ -333,7 +342,8 @@ def _check_optimum(task: Task, make: Make, act: Callable[[Array], Array], seed: 
             _, rewards, _, _, info = agents.by_agent(returned)
             for name, reward in rewards.items():
                 expect_near(f"{_of(name)}the optimum's regret", info[name]["regret"], 0.0, 1e-9)
-                returns[name] += float(reward)
+                on_top = sum(info[name].get(key, 0.0) for key in ON_TOP)
+                returns[name] += float(reward) - on_top
         expect_equal("the optimum's steps", steps, spec.horizon)
         for name, total in returns.items():
             what = f"{_of(name)}the optimum's return"

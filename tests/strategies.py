@@ -33,7 +33,13 @@ def teams(draw: st.DrawFn, state_dim: int, action_dim: int) -> dict[str, Any]:
     return {"agents": agents, "reward": draw(st.sampled_from(["individual", "team"]))}
 
 
-SAFETY = st.fixed_dictionaries({"tightness": st.floats(0.0, 0.5, exclude_min=True)})
+SAFETY = st.fixed_dictionaries(
+    {"tightness": st.floats(0.0, 0.5, exclude_min=True), "compensated": st.booleans()}
+)
+SHAPING = st.fixed_dictionaries(
+    {"scale": st.floats(0.01, 100.0), "discount": st.sampled_from([1.0, 0.9, 0.0])}
+)
+NOISE = st.fixed_dictionaries({"reward": st.floats(0.0, 10.0), "transition": st.floats(0.01, 1.0)})
 
 
 @st.composite
@@ -53,7 +59,7 @@ def observations(draw: st.DrawFn) -> dict[str, Any]:
 def spec_fields(
     draw: st.DrawFn, team: bool | None = None, *, plain: bool = False
 ) -> dict[str, Any]:
-    """The fields of a valid spec; `plain` leaves safety and observation out."""
+    """The fields of a valid spec; `plain` leaves out what METHOD's section 1 does not have."""
     state_dim, action_dim = draw(st.integers(1, 6)), draw(st.integers(1, 5))
     fields = {
         "state_dim": state_dim,
@@ -74,6 +80,12 @@ def spec_fields(
             fields["safety"] = draw(SAFETY)
         if draw(st.booleans()):
             fields["observation"] = draw(observations())
+    if not plain:
+        fields |= {
+            name: draw(block)
+            for name, block in (("shaping", SHAPING), ("noise", NOISE))
+            if draw(st.booleans())
+        }
     agents = fields.get("team", {}).get("agents", [])
     if state_dim > 1 and all(len(agent["observes"]) > 1 for agent in agents):
         fields["rotation"] = draw(ANGLES)

@@ -43,9 +43,12 @@ from sme_registry.task.draw import bit_generator, to_uniform
 from sme_registry.task.loading import check_memory
 from sme_registry.task.task import (
     COST,
+    PRICE,
     REGRET,
     REWARD,
+    REWARD_NOISE,
     SAFE_REGRET,
+    SHAPING,
     SIMILARITY,
     STEP_REWARD,
     Array,
@@ -60,6 +63,11 @@ Act = Callable[[Array, Observation], Array]
 BehaviourPolicy = Callable[[range], Act]
 """How to act in new episodes with these numbers, one in each environment."""
 
+_ON_TOP = (
+    ("compensated", "prices", PRICE),
+    ("shaping", "shapings", SHAPING),
+    ("reward_noise", "reward_noises", REWARD_NOISE),
+)
 _AHEAD = 64  # steps whose random numbers an episode reads at once
 _BLOCK = 64  # observations in one call of a user's policy
 _ENVS = 512
@@ -74,9 +82,9 @@ def noise_task(task: Task, seed: int | str) -> Task:
 
 
 def _plain(task: Task) -> Task:
-    """The same π* without limits and distractors, which take time."""
-    spec = task.spec.derive(safety=None, observation=None)
-    return replace(task, spec=spec, limiting=(), distractor_transition=None, mixing=())
+    """The same π* without all else, which takes time."""
+    spec = task.spec.derive(safety=None, observation=None, shaping=None, noise=None)
+    return replace(task, spec=spec, limiting=(), distractor_transition=None, mixing=(), shaping=())
 
 
 def _optimal_policy(plain: Task, num_envs: int) -> Callable[[Array], Array]:
@@ -207,7 +215,7 @@ def collect(
     """
     spec = recipe.spec
     S, A, n, m = spec.state_dim, spec.action_dim, len(task.policies), spec.distractors
-    row = 24 * (S + m) + 12 * A + 48 * n + 64
+    row = 24 * (S + m) + 12 * A + 56 * n + 64 + 8 * S * (spec.noise is not None)
     if spec.safety is not None:
         row += 16 * A + 16
     check_memory(
@@ -276,7 +284,7 @@ def _rows(kept: Mask, episodes: Indices, t: int, step: PlayStep, batch: Batch) -
     columns: Arrays = {
         "episode": episodes,
         "t": np.full(len(kept), t),
-        "values": result.values.transpose(2, 0, 1),  # `[B, 5, n]`; with safety 7
+        "values": result.values.transpose(2, 0, 1),  # `[B, 5 … 10, n]`
         "limits": result.actions[1:].transpose(1, 0, 2),  # with safety `[B, 2, A]`
         "states": step.state,
         "next_states": batch.state,
@@ -285,6 +293,7 @@ def _rows(kept: Mask, episodes: Indices, t: int, step: PlayStep, batch: Batch) -
         "actions": step.action,
         "optimal_actions": result.optimal,
         "terminations": result.terminated,
+        "noise": step.noise[:, result.values.shape[1] :],
         "distractors": step.distractors,
         "next_distractors": batch.distractors,
     }
@@ -320,6 +329,12 @@ def _join(parts: list[Arrays], spec: SMESpec) -> Transitions:
     if spec.safety is not None:
         columns |= {"costs": of_row(COST), "safe_regrets": of_row(SAFE_REGRET)}
         columns |= {"limits": limits[:, 0].copy(), "safe_actions": limits[:, 1].copy()}
+    for attribute, name, row in _ON_TOP:
+        if getattr(spec, attribute):
+            columns[name] = of_row(row)
+    noise = columns.pop("noise")
+    if task_noise := spec.noise:
+        columns |= {"transition_noises": noise} if task_noise.transition else {}
     if not spec.distractors:
         del columns["distractors"], columns["next_distractors"]
     if spec.team is not None:

@@ -47,6 +47,10 @@ _INFOS = {  # the column of an info's rows, and that of the row after the last s
     "limit": ("limits", "limits"),
     "safe_action": ("safe_actions", "safe_actions"),
     "safe_regret": ("safe_regrets", "safe_regrets"),
+    "price": ("prices", "prices"),
+    "shaping": ("shapings", "shapings"),
+    "reward_noise": ("reward_noises", "reward_noises"),
+    "transition_noise": ("transition_noises", "transition_noises"),
 }
 _REQUIRED = {field.name for field in fields(Transitions) if field.default is MISSING}
 

@@ -81,7 +81,7 @@ class Transitions(AlignedArrays):
       observations: `[N, O]` float32 in [0, 1]: s, t/T, and each agent's r_cum/k, before the step.
         With `observation` what the agent saw, M(s, d) `[S + m]`, in place of s.
       actions: `[N, A]` float32 in [0, 1], as the environment executed them.
-      rewards: `[N]` float64 in [0, k], R; of a team the mean over its agents.
+      rewards: `[N]` float64, R in [0, k] and what is paid on top; of a team the mean over agents.
       next_observations: `[N, O]` float32, after the step; also at the end of a trajectory.
       terminations: `[N]` bool: the episode ended by D. Do not bootstrap.
       timeouts: `[N]` bool: the trajectory ends here but the task continues. Bootstrap from
@@ -97,6 +97,9 @@ class Transitions(AlignedArrays):
         action, ℓ(s), and min(π*(s), ℓ(s)); None without `safety`, as is the next.
       safe_regrets: `[N]` float64 in [−1, 1], the step reward of the safe action minus r.
       distractors, next_distractors: `[N, m]` float64 in [0, 1]; None without distractors.
+      prices, shapings, reward_noises: `[N]` float64, what is paid on top of R; of a team `[N, n]`.
+        None where the task does not pay it.
+      transition_noises: `[N, S]` float64, ζ; None without noise of the transition.
     """
 
     observations: Observation
@@ -120,6 +123,10 @@ class Transitions(AlignedArrays):
     safe_regrets: Array | None = None
     distractors: Array | None = None
     next_distractors: Array | None = None
+    prices: Array | None = None
+    shapings: Array | None = None
+    reward_noises: Array | None = None
+    transition_noises: Array | None = None
 
     @property
     def ends(self) -> Indices:
@@ -211,7 +218,7 @@ def _expected(
 ) -> dict[str, tuple[npt.NDArray[Any], float | Array]]:
     """What a task gives for the rows of a data set, `[N, …]`, and with which tolerance."""
     spec, s, a = task.spec, columns["states"], columns["actions"].astype(np.float64)
-    result = _steps(task, columns["observations"], s, t, a, ends)
+    result = _steps(task, columns, t, ends)
     step_reward, optimal = result.step_reward, result.optimal_action
     starts = np.repeat(t[[0, *ends[:-1]]], np.diff(ends, prepend=0))
     of_reward = spec.k * np.where(starts == 0, TOLERANCE, _ROUNDED)[:, None]
@@ -224,6 +231,9 @@ def _expected(
         "terminations": (result.terminated[:, None], 0.0),
         "rewards" if spec.team is None else "agent_rewards": (result.reward, of_reward),
     }
+    for name, column in (("prices", result.price), ("shapings", result.shaping)):
+        if name in columns:
+            expected[name] = column, TOLERANCE * max(1.0, spec.shaping.scale if spec.shaping else 1)
     for which, time in (("", t), ("next_", t + 1)):
         seen = task.seen(columns[f"{which}states"], columns.get(f"{which}distractors"))
         seen = np.concatenate([seen, (time / spec.horizon)[:, None]], axis=1).astype(np.float32)
@@ -248,17 +258,26 @@ def _expected(
     return expected
 
 
-def _steps(
-    task: Task, observations: Observation, s: Array, t: Indices, a: Array, ends: Indices
-) -> Step:
-    """The rows of a data set as steps of the task, of all trajectories at once."""
+def _steps(task: Task, columns: Arrays, t: Indices, ends: Indices) -> Step:
+    """The rows of a data set as steps of the task, of all trajectories at once.
+
+    ξ is that of the stored noise of the reward, so that of the reward all else is checked.
+    """
+    observations, s, a = (columns[name] for name in ("observations", "states", "actions"))
+    a, n = a.astype(np.float64), len(task.policies)
+    noise = np.zeros((len(t), n + task.spec.state_dim))
+    if "reward_noises" in columns:
+        noise[:, :n] = columns["reward_noises"].reshape(len(t), n) / task.sigmas[0]
+    if "transition_noises" in columns:
+        noise[:, n:] = columns["transition_noises"]
     starts, lengths = np.array([0, *ends[:-1]]), np.diff(ends, prepend=0)
     accumulated = observations[starts, -len(task.policies) :].astype(np.float64) * task.spec.k
     rows, results = [], []
     for number in range(int(lengths.max())):
         running = lengths > number
         rows.append(starts[running] + number)
-        result = step(task, s[rows[-1]], t[rows[-1]], accumulated[running], a[rows[-1]])
+        row = rows[-1]
+        result = step(task, s[row], t[row], accumulated[running], a[row], noise[row])
         accumulated[running] = result.accumulated_reward
         results.append(result)
     order = np.argsort(np.concatenate(rows))
@@ -339,7 +358,7 @@ def exact_return(
         is then Q(s, a) instead of V(s).
       gamma: γ in [0, 1] of the discounted return.
       rollouts: episodes from each state: 1 for a deterministic policy, whose return is exact; more
-        for a stochastic one or distractors, whose mean gets a 95 % interval (Student's t).
+        for a stochastic one, distractors or noise, whose mean gets a 95 % interval (Student's t).
       action_range: of the policy's actions; None takes its own, and "unit" for a callable.
 
     Examples:
@@ -439,7 +458,9 @@ def _check_deterministic(
     batch = Batch(task, min(len(s), MOST_ENVS))
     batch.place(s[:MOST_ENVS], t[:MOST_ENVS], r_cum[:MOST_ENVS, None])
     reason = ""
-    if task.spec.distractors:
+    if task.spec.noise is not None:
+        reason = "the task has noise"
+    elif task.spec.distractors:
         reason = f"the task has {task.spec.distractors} distractors, which are drawn at random"
     elif not np.array_equal(policy(batch.observe()), policy(batch.observe())):
         reason = "the policy is stochastic"

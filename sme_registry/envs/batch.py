@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -20,22 +20,28 @@ from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import Task
+from sme_registry.task.draw import normal_of_steps
 from sme_registry.task.engine import Engine, StepMany, draw, engine
 from sme_registry.task.loading import check_memory
 from sme_registry.task.task import (
     ACCUMULATED_REWARD,
+    COST,
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
     REWARD,
+    SHAPING,
     Array,
     Indices,
     Mask,
     Observation,
+    own_rows,
+    shaping_at_switch,
 )
 
 _FLOAT64 = np.dtype(np.float64)
 _AHEAD = 16  # states drawn at once for an environment
+_NOISE_AHEAD = 64  # steps of a single environment whose noise is drawn at once
 _MAX_NUMBERS = 2**19  # held in advance for all environments, 4 MiB
 _KEPT = 3  # a loop holds an observation and the next one while a step writes the third
 _KEY_SHIFT = np.uint64(12)  # keys of 52 bits, which a float64 holds exactly
@@ -46,7 +52,7 @@ class BatchStep(NamedTuple):
 
     observation: Observation  # `[B, …]`: s or M(s, d), t/T, each agent's r_cum/k, a shown phase
     actions: Array  # `[1 or 3, B, A]` of the unit range: π*; with `safety` limits and safe actions
-    values: Array  # `[5 or 7, n, B]`: the rows of `task.task`
+    values: Array  # `[5 … 10, n, B]`: the rows of `task.task`
     terminated: Mask
     truncated: Mask
 
@@ -85,7 +91,7 @@ class _Results:
 
     def _allocate(self) -> _Arrays:
         observation, actions, values, ends = self._shapes
-        numbers = np.empty(actions), np.empty(values)
+        numbers = np.empty(actions), np.zeros(values)  # not every task writes every row
         return np.empty(observation, np.float32), *numbers, np.empty(ends, bool)
 
 
@@ -139,46 +145,111 @@ class InitialStates:
         return states
 
 
-class Distractors:
-    """The distractors of `B` environments, and the random numbers that move them; often m = 0.
+class StepNumbers:
+    """The random numbers that steps of `B` environments use, and the distractors that they move.
 
-    Both come from streams of their own, so that initial states are as without `observation`.
+    They come from streams of their own, so that initial states are as without them.
     """
 
-    def __init__(self, count: int, num_envs: int) -> None:
-        self._count = count
-        # `[2 + m, B]`: each environment's key, numbers drawn, and distractors.
-        self.own = np.zeros((OWN_DISTRACTORS + count, num_envs))
-        if count:
+    def __init__(self, specs: Sequence[SMESpec], num_envs: int) -> None:
+        self._m, n = specs[0].distractors, len(specs[0].agents)
+        sigmas = [spec.noise for spec in specs if spec.noise is not None]
+        rows = {"reward": slice(1, 1 + n), "transition": slice(1 + n, None)}
+        self._noise = {
+            f"noise/{name}": part
+            for name, part in rows.items()
+            if any(getattr(noise, name) for noise in sigmas)
+        }
+        self.own = np.zeros((own_rows(specs[0]), num_envs))  # see `task.task`
+        self._drawn_ahead: tuple[Any, Array] = (None, np.empty(0))
+        if self.are_drawn:
             words = np.random.SeedSequence().generate_state(num_envs, np.uint64)
             self.own[OWN_KEY] = words >> _KEY_SHIFT
+            self.draw_noise()
 
     @property
-    def values(self) -> Array:
-        return self.own[OWN_DISTRACTORS:].T.copy()
+    def distractors(self) -> Array:
+        return self._of_distractors.T.copy()
+
+    @property
+    def noise(self) -> Array:
+        return self.own[OWN_DISTRACTORS + self._m + 1 :].T.copy()
+
+    @property
+    def are_drawn(self) -> bool:
+        """Whether steps or episodes draw any."""
+        return bool(self._m or self._noise)
+
+    @property
+    def has_noise(self) -> bool:
+        return bool(self._noise)
+
+    @property
+    def _of_distractors(self) -> Array:
+        of_distractors: Array = self.own[OWN_DISTRACTORS:][: self._m]
+        return of_distractors
 
     def seed(self, env: int, seed: int) -> None:
-        """Restart a stream. It is none of those that the seed gives to initial states."""
-        if self._count:
+        """Restart the streams. They are none of those that the seed gives to initial states."""
+        if self.are_drawn:
             (word,) = np.random.SeedSequence(seed, spawn_key=(1,)).generate_state(1, np.uint64)
             self.own[OWN_KEY, env] = word >> _KEY_SHIFT
-            self.own[OWN_DRAWN, env] = 0.0
+            self.own[[OWN_DRAWN, OWN_DISTRACTORS + self._m], env] = 0.0
+            self.draw_noise(slice(env, env + 1))
+
+    def draw_noise(self, envs: slice = slice(None)) -> None:
+        """Draw the noise of the next step: an action that is refused then changes nothing."""
+        if not self._noise:
+            return
+        own = self.own[:, envs]
+        key, of_noise = own[OWN_KEY].astype(np.uint64), own[OWN_DISTRACTORS + self._m :]
+        of_noise[:] = (
+            self._of_one(key, of_noise)
+            if len(self.own[0]) == 1
+            else (self._noise_of(key, of_noise[0]))
+        )
+
+    def _of_one(self, key: npt.NDArray[np.uint64], of_noise: Array) -> Array:
+        """As `_noise_of` a single environment, whose steps are drawn some at once."""
+        block, place = divmod(int(of_noise[0, 0]), _NOISE_AHEAD)
+        drawn = key.item(), block
+        if self._drawn_ahead[0] != drawn:
+            steps = np.arange(block * _NOISE_AHEAD, (block + 1) * _NOISE_AHEAD, dtype=np.float64)
+            self._drawn_ahead = drawn, self._noise_of(np.repeat(key, _NOISE_AHEAD), steps)
+        return self._drawn_ahead[1][:, place : place + 1]
+
+    def _noise_of(self, key: npt.NDArray[np.uint64], steps: Array) -> Array:
+        """How many steps have drawn after these `[n]`, and the noise, `[1 + agents + S, n]`."""
+        drawn = np.zeros((len(self.own) - OWN_DISTRACTORS - self._m, len(steps)))
+        drawn[0] = steps + 1.0
+        for name, rows in self._noise.items():
+            drawn[rows] = normal_of_steps(key, name, steps, len(drawn[rows])).T
+        return drawn
+
+    def snapshot(self) -> dict[str, Array]:
+        """Copies of what `seed` does not give."""
+        drawn, noise = np.split(self.own[OWN_DRAWN:], [1 + self._m])
+        return {"distractors": drawn.copy(), **({"noise": noise.copy()} if self._noise else {})}
+
+    def restore(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
+        parts = [snapshot[name] for name in ("distractors", "noise") if name in snapshot]
+        self.own[OWN_DRAWN:][: sum(map(len, parts))] = np.concatenate(parts)
 
     def begin(self, envs: Indices, distractors: Array | None = None) -> None:
-        """Those of environments that begin an episode, `[len(envs), m]`; None draws them."""
-        if not self._count:
+        """Distractors of environments that begin an episode, `[len(envs), m]`; None draws them."""
+        if not self._m:
             return
         if distractors is None:
             own = self.own[:, envs]
-            distractors = draw(own, self._count)
+            distractors = draw(own, self._m)
             self.own[OWN_DRAWN, envs] = own[OWN_DRAWN]
-        self.own[OWN_DISTRACTORS:, envs] = distractors.T
+        self._of_distractors[:, envs] = distractors.T
 
     def beside(self, states: Array, envs: Indices) -> Array:
         """Some environments' states `[S, len(envs)]` and distractors, `[S + m, len(envs)]`."""
-        if not self._count:
+        if not self._m:
             return states
-        return np.concatenate([states, self.own[OWN_DISTRACTORS:, envs]])
+        return np.concatenate([states, self._of_distractors[:, envs]])
 
 
 class Batch:
@@ -204,7 +275,7 @@ class Batch:
         S, A, m = spec.state_dim, spec.action_dim, spec.distractors
         P = self.document.observed_phases
         check_memory(
-            num_envs * 8 * (5 * (S + m) + 12 * A + 20 * n + 54 + 3 * P),
+            num_envs * 8 * (5 * (S + own_rows(spec)) + 12 * A + 20 * n + 44 + 3 * P),
             f"num_envs={num_envs}: a batch this large",
             "Use fewer environments.",
         )
@@ -213,7 +284,7 @@ class Batch:
         self.observation_dim = S + m + 1 + n + P  # of all agents
         self._of_t, self._of_phase = S + m, S + m + 1 + n  # columns of the observation
         self.initial_states = InitialStates(num_envs, S)
-        self._distractors = Distractors(m, num_envs)
+        self._numbers = StepNumbers(self.document.specs, num_envs)
         # Channel by channel, [S, B] and [n, B], as the compiled step reads them.
         self._s = np.zeros((S, num_envs))
         self._t = np.zeros(num_envs, np.int64)
@@ -246,7 +317,12 @@ class Batch:
 
     @property
     def distractors(self) -> Array:
-        return self._distractors.values
+        return self._numbers.distractors
+
+    @property
+    def noise(self) -> Array:
+        """ξ of each agent and ζ of the next step, `[B, n + S]`."""
+        return self._numbers.noise
 
     def _load_engine(self) -> None:
         self._engines: dict[int, Engine] = {}
@@ -286,15 +362,15 @@ class Batch:
     def seed(self, env: int, seed: int) -> None:
         """Restart an environment's generators, and its life."""
         self.initial_states.seed(env, seed)
-        self._distractors.seed(env, seed)
+        self._numbers.seed(env, seed)
         self.live(env, 0)
 
     def seed_by_states(self, envs: Indices, states: Array, seed: int = 0) -> None:
         """Restart distractors from initial states `[len(envs), S]` and a seed, alike anywhere."""
-        if self.task.spec.distractors:
+        if self._numbers.are_drawn:
             for env, s in zip(envs.tolist(), states, strict=True):
                 word = int.from_bytes(s.astype("<f8").tobytes(), "little")
-                self._distractors.seed(env, seed + word)
+                self._numbers.seed(env, seed + word)
 
     def live(self, env: int, lifetime: int) -> None:
         """Let a life go on after so many steps, at its next `begin`."""
@@ -326,7 +402,7 @@ class Batch:
         self._s[:, envs] = states.T
         self._t[envs] = 0
         self._accumulated[:, envs] = 0.0
-        self._distractors.begin(envs, distractors)
+        self._numbers.begin(envs, distractors)
         self._write_seen(states.T, envs, observation)
         observation[envs, self._of_t : self._of_phase] = 0.0
         observation[envs, self._of_phase :] = self._one_hot[envs]
@@ -337,7 +413,7 @@ class Batch:
             "states": self._s.copy(),
             "t": self._t.copy(),
             "accumulated": self._accumulated.copy(),
-            "distractors": self._distractors.own[OWN_DRAWN:].copy(),
+            **self._numbers.snapshot(),
             "begun": self.initial_states.count.copy(),
         }
 
@@ -346,7 +422,7 @@ class Batch:
         self._s[:] = snapshot["states"]
         self._t[:] = snapshot["t"]
         self._accumulated[:] = snapshot["accumulated"]
-        self._distractors.own[OWN_DRAWN:] = snapshot["distractors"]
+        self._numbers.restore(snapshot)
         for env, count in enumerate(snapshot["begun"].tolist()):
             self.initial_states.skip(env, count)
 
@@ -358,7 +434,7 @@ class Batch:
         self._s[:] = states.T
         self._t[:] = t
         self._accumulated[:] = accumulated.T
-        self._distractors.begin(self._envs)
+        self._numbers.begin(self._envs)
 
     def advance(self, actions: Array, resting: Mask | None = None) -> BatchStep:
         """One step, from actions `[B, A]` of the unit range, clipped; ActionError changes nothing.
@@ -370,32 +446,41 @@ class Batch:
             raise ActionError(f"action of shape {actions.shape}: must be of shape {self._shape}.")
         if actions.dtype is not _FLOAT64 or not actions.flags.c_contiguous:
             actions = np.ascontiguousarray(actions, dtype=np.float64)
-        own, moved = self._distractors.own, self._moved
-        drawn = None if resting is None else own[OWN_DRAWN, resting]
+        own, moved = self._numbers.own, self._moved
+        kept = None if resting is None else own[:, resting]
         arrays, result = self._take()
         observation, optimal, values, ends = arrays
+        if self.schedule.is_stream:
+            values[COST:] = 0.0  # the rows that not every task of a stream has
         if not self._step_many(
             self._s, self._t, self._accumulated, own, actions, moved,
             observation, optimal, values, ends,
         ):  # fmt: skip
             raise not_finite_error()
         self._s, self._moved = moved, self._s
-        if drawn is not None:
-            own[OWN_DRAWN, resting] = drawn
+        self._numbers.draw_noise()
+        if kept is not None:
+            own[:, resting] = kept
         if self.schedule.is_stream:
-            self._live_on(observation, resting)
+            self._live_on(result, resting)
         if self._limit is not None:
-            self._truncate(np.flatnonzero(self._t >= self._limit), observation, values, ends)
+            self._truncate(np.flatnonzero(self._t >= self._limit), result)
         return result
 
-    def _truncate(self, envs: Indices, observation: Observation, values: Array, ends: Mask) -> None:
-        ends[1, envs] = True
+    def _truncate(self, envs: Indices, result: BatchStep) -> None:
+        result.truncated[envs] = True
+        values, observation = result.values, result.observation
         values[REWARD][:, envs] += self._accumulated[:, envs]
         values[ACCUMULATED_REWARD][:, envs] = 0.0
         self._accumulated[:, envs] = 0.0
         observation[envs, self._of_t + 1 : self._of_phase] = 0.0
+        if "shaping" in self.schedule.columns.numbers:
+            for env in envs[~result.terminated[envs]].tolist():
+                change = shaping_at_switch(self.task_of(env), None, self._s[:, env], self._t[env])
+                values[[REWARD, SHAPING], :, env] += change
 
-    def _live_on(self, observation: Observation, resting: Mask | None) -> None:
+    def _live_on(self, result: BatchStep, resting: Mask | None) -> None:
+        observation = result.observation
         self._lifetime += 1 if resting is None else ~resting
         self.lived = self.life()  # before the switch: of the task in which the action was taken
         if self._one_hot.shape[1]:
@@ -404,8 +489,10 @@ class Batch:
             self._soonest -= 1
             if self._soonest <= 0:
                 envs = np.flatnonzero(self._lifetime >= self._next_switch)
+                before = self._segment[envs]
                 self._switch(envs)
                 self._write_segment(envs, observation)
+                self._pay_switch(envs, before, result)
                 self._soonest = self._until_switch()
 
     def _switch(self, envs: Indices) -> None:
@@ -418,6 +505,16 @@ class Batch:
             self._segment[over] = np.array(segments)[which]
             self._next_switch[over] = np.array(switches)[which]
             self._put_in_force()
+
+    def _pay_switch(self, envs: Indices, before: Indices, result: BatchStep) -> None:
+        """Pay what the segments now in force change in the shaping of the last step."""
+        if "shaping" not in self.schedule.columns.numbers:
+            return
+        for env, segment in zip(envs.tolist(), before.tolist(), strict=True):
+            if not (result.terminated[env] or result.truncated[env]):
+                tasks = self.schedule.tasks[segment], self.task_of(env)
+                change = shaping_at_switch(*tasks, self._s[:, env], self._t[env])
+                result.values[[REWARD, SHAPING], :, env] += change
 
     def _until_switch(self) -> int:
         return int((self._next_switch - self._lifetime).min())
@@ -467,7 +564,7 @@ class Batch:
         return True
 
     def _write_seen(self, states: Array, envs: Indices, observation: Observation) -> None:
-        observation[envs, : self._of_t] = self._see(self._distractors.beside(states, envs)).T
+        observation[envs, : self._of_t] = self._see(self._numbers.beside(states, envs)).T
 
     def _write_segment(self, envs: Indices, observation: Observation) -> None:
         """Write what depends on the segment in force into rows: each r_cum/k, and the phase."""

@@ -43,9 +43,9 @@ class StepColumns(NamedTuple):
     actions: tuple[str, ...]  # keys whose values are `[A]`, in the environment's action range
 
     @classmethod
-    def of(cls, spec: SMESpec) -> StepColumns:
-        def has(field: str) -> bool:
-            return not field or getattr(spec, field) is not None
+    def of(cls, specs: Sequence[SMESpec]) -> StepColumns:
+        def has(attribute: str) -> bool:
+            return not attribute or any(getattr(spec, attribute) for spec in specs)
 
         rows = {name: row for row, (name, field) in enumerate(NUMBERS.items()) if has(field)}
         actions = tuple(name for name, field in ACTIONS.items() if has(field))
@@ -64,7 +64,7 @@ class StepColumns(NamedTuple):
         return arrays | {key: np.zeros(num_envs) for key in self.numbers}
 
     def at_step(self, actions: Array, values: Array, rescaled: bool) -> dict[str, Any]:
-        """The info of a step from its `actions` `[1 or 3, …, A]` and `values` `[5 or 7, …]`."""
+        """The info of a step from its `actions` `[1 or 3, …, A]` and `values` `[5 … 10, …]`."""
         info = {key: values[row] for key, row in self.numbers.items()}
         in_range = arguments.from_unit(actions, rescaled)
         for row, key in enumerate(self.actions):
@@ -77,7 +77,7 @@ class Schedule:
 
     def __init__(self, document: SMESpec | StreamSpec, tasks: Sequence[Task]) -> None:
         self.document, self.tasks = document, tuple(tasks)  # of each segment of a cycle
-        self.columns = StepColumns.of(tasks[0].spec)
+        self.columns = StepColumns.of(document.specs)
         self.is_stream = isinstance(document, StreamSpec)
         self.phases = np.array([segment.phase for segment in document.segments])
         self.k = np.array([task.spec.k for task in tasks])

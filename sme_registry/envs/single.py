@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.envs import arguments
-from sme_registry.envs.batch import Distractors
+from sme_registry.envs.batch import StepNumbers
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
 from sme_registry.envs.schedule import GymnasiumMixin, Schedule
 from sme_registry.errors import EpisodeError
@@ -23,11 +23,13 @@ from sme_registry.task.engine import engine
 from sme_registry.task.task import (
     ACCUMULATED_REWARD,
     BUFFER_STATE,
+    BUFFER_T,
     BUFFER_VALUES,
     Action,
     Array,
     Indices,
     Observation,
+    shaping_at_switch,
 )
 
 _FLOAT32, _FLOAT64 = np.dtype(np.float32), np.dtype(np.float64)
@@ -95,8 +97,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self._status = "not begun"
         self._time_limit: Any = None  # an outer TimeLimit below the horizon
-        self._keyed_by: np.random.Generator | None = None  # of which the distractors' stream is
-        self._distractors = Distractors(self._schedule.tasks[0].spec.distractors, 1)
+        self._keyed_by: np.random.Generator | None = None  # of which the streams of steps are
+        self._random = StepNumbers(self.document.specs, 1)
         # The lifetimes of a stream's next steps, the last one first; a task needs none.
         self._lifetimes: list[Any] = [0]
         self._look_ahead(0)
@@ -115,7 +117,12 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     @property
     def distractors(self) -> Array:
         """The distractors d, `[m]` float64 in [0, 1] (a copy); empty where the task has none."""
-        return cast(Array, self._distractors.values[0])
+        return cast(Array, self._random.distractors[0])
+
+    @property
+    def noise(self) -> Array:
+        """ξ and ζ of the next step, `[1 + S]` (a copy); 0 where the task has none."""
+        return cast(Array, self._random.noise[0])
 
     def _put_in_force(self, segment: int) -> None:
         """Run the task of a segment; the episode, if one is running, goes on by `_load_engine`."""
@@ -128,12 +135,15 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self._engine = engine(self.task)
         self._buffer, self._numbers = self._engine.new_buffer()  # a view of the buffer
         own = self._numbers[BUFFER_STATE + self.document.state_dim :, None]
-        own[:] = self._distractors.own
-        self._distractors.own = own
+        own[:] = self._random.own
+        self._random.own = own
         # Views of no dimension: `view[()]` makes a NumPy number in a third of `np.float64`'s time.
         rows = self._schedule.columns.numbers.items()
         values = [(key, self._numbers[BUFFER_VALUES + row, ...]) for key, row in rows]
         self._values, self._more_values = values[:4], values[4:]
+        self._shaping = None  # the view of the shaping, where a task has this alone
+        if [key for key, _ in values[4:]] == ["shaping"] and not self._schedule.is_stream:
+            self._shaping, self._more_values = values[4][1], []
         self._rows: list[tuple[Array, Observation]] = []
         self._step: Callable[[Any, Any], _Result] = _check_running
         if self._status == "running":
@@ -141,7 +151,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     # Machine code cannot be pickled or copied: the copy looks it up again.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = {"_engine", "_buffer", "_values", "_more_values", "_rows", "_step"}
+        dropped = {"_engine", "_buffer", "_values", "_more_values", "_shaping", "_rows", "_step"}
         return {name: value for name, value in vars(self).items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -187,12 +197,12 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     def _begin_seeing(self, s: Array, distractors: Array | None) -> npt.NDArray[Any]:
         """Begin an episode of the distractors; what the agent sees of the state, `[S + m]`."""
         if self._keyed_by is not self.np_random:
-            self._distractors.seed(0, self._distractors_seed())
+            self._random.seed(0, self._seed_of_steps())
             self._keyed_by = self.np_random
-        self._distractors.begin(_ONLY, None if distractors is None else distractors[None])
-        return self._engine.seen(self._distractors.beside(s[:, None], _ONLY))[:, 0]
+        self._random.begin(_ONLY, None if distractors is None else distractors[None])
+        return self._engine.seen(self._random.beside(s[:, None], _ONLY))[:, 0]
 
-    def _distractors_seed(self) -> int:
+    def _seed_of_steps(self) -> int:
         """The seed of the generator, or a number from a copy of one that the user has set."""
         # −1 where the user has set the generator; Gymnasium before 1.0 has no such attribute.
         seed: int = getattr(self, "np_random_seed", -1)
@@ -222,6 +232,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             numbers = self._numbers
             self._put_in_force(segment)
             self._numbers[:] = numbers
+            for _, view in self._more_values:
+                view[()] = 0.0  # not every task of a stream writes them
 
     def step(self, action: Action) -> _Result:
         """One step, from an action `[A]`, finite; clipped to the action range.
@@ -241,9 +253,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         no_checks = None if more_to_do else _FLOAT32
         step_one = self._engine.step_one
         plain_step = step_one(no_checks or _FLOAT64)
-        more_to_do |= len(self._parts) > 1
+        more_to_do |= len(self._parts) > 1 or self._random.has_noise
         buffer, next_rows = self._buffer, self._rows.pop
         similarity, step_reward, regret, accumulated_reward = (view for _, view in self._values)
+        shaping, more_values = self._shaping, self._more_values
         phase, lifetimes, is_stream = self._phase, self._lifetimes, self._schedule.is_stream
 
         def step(env: SMEEnv, action: Any) -> _Result:
@@ -272,6 +285,15 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
                     "phase": phase,
                     "lifetime": lifetimes.pop(),
                 }
+            elif shaping is not None:
+                info = {
+                    "optimal_action": optimal,
+                    "similarity": similarity[()],
+                    "step_reward": step_reward[()],
+                    "regret": regret[()],
+                    "accumulated_reward": accumulated_reward[()],
+                    "shaping": shaping[()],
+                }
             else:
                 info = {
                     "optimal_action": optimal,
@@ -280,8 +302,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
                     "regret": regret[()],
                     "accumulated_reward": accumulated_reward[()],
                 }
+            for key, view in more_values:
+                info[key] = view[()]
             if end or more_to_do or not lifetimes:
-                env._after(end, action, info, observation)
+                reward += env._after(end, action, info, observation)
                 return observation, reward, end == 1.0 or end == 3.0, end >= 2.0, info
             return observation, reward, False, False, info
 
@@ -308,33 +332,47 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     def _after(
         self, end: float, action: Any, info: dict[str, Any], observation: Observation
-    ) -> None:
-        """What the fast path leaves out: actions not taken, switches, safety, the end, frames."""
+    ) -> float:
+        """What the fast path leaves out: noise, actions not taken, switches, the end, frames.
+
+        Returns what a switch adds to the reward.
+        """
+        added = 0.0
         if end < 0.0:
             if self._schedule.is_stream:
                 self._lifetimes.append(info["lifetime"])  # nothing was lived
             self._checked(action)  # raises where the size is wrong
             raise arguments.not_finite_error()
+        self._random.draw_noise()
         if not self._lifetimes:
-            self._go_on(int(info["lifetime"]), observation)
+            added = self._go_on(int(info["lifetime"]), observation, bool(end))
+            if added:
+                info["shaping"] += added
         row = arguments.from_unit(info["optimal_action"], self._rescaled)
         for key, part in self._parts:  # slices: `reshape` takes three times as long
             info[key] = row[part]
-        for key, view in self._more_values:
-            info[key] = view[()]
         if end:
             self._status, self._step = "ended", _check_running
         if self.render_mode is not None:
             self._record(self.state, action, info)
+        return added
 
-    def _go_on(self, lifetime: int, observation: Observation) -> None:
-        """Look further ahead; where a segment ends within an episode, put the next in force."""
+    def _go_on(self, lifetime: int, observation: Observation, ended: bool) -> float:
+        """Look further ahead; where a segment ends within an episode, put the next in force.
+
+        Returns what that adds to the shaping of the last step.
+        """
         self._look_ahead(lifetime)
+        added = 0.0
         if self._schedule.switches_within:
+            before = self.task
             self._enter(self._schedule.segment(lifetime))
             S = self.document.state_dim
             waiting = self._numbers[BUFFER_VALUES + ACCUMULATED_REWARD] / self.sme_spec.k
             observation[S + 1], observation[S + 2 :] = min(waiting, 1.0), self._one_hot
+            if not ended:
+                added = shaping_at_switch(before, self.task, self.state, self._numbers[BUFFER_T])
+        return added
 
     def _checked(self, action: Any) -> Array:
         return arguments.to_unit(action, self._action_shape, self._rescaled)
@@ -354,6 +392,11 @@ def _limited(step: Callable[[Any, Any], _Result]) -> Callable[[Any, Any], _Resul
         limit = env._time_limit
         if not truncated and limit._elapsed_steps + 1 >= limit._max_episode_steps:
             reward, truncated = reward + env._pay_out(observation, info), True
+            if "shaping" in info and not terminated:
+                t = env._numbers[BUFFER_T]
+                change = shaping_at_switch(env.task, None, env.state, t)
+                info["shaping"] += change
+                reward += change
         return observation, reward, terminated, truncated, info
 
     return limited

@@ -145,6 +145,11 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         """The distractors, `[B, m]` float64 in [0, 1] (a copy); `[B, 0]` without any."""
         return self._batch.distractors
 
+    @property
+    def noise(self) -> Array:
+        """ξ and ζ of the next steps, `[B, 1 + S]` (a copy); 0 where the task has none."""
+        return self._batch.noise
+
     def reset(
         self,
         *,

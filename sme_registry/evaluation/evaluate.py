@@ -170,7 +170,7 @@ def versions_behind(oracle: Engine) -> dict[str, str]:
 
 def same_draw(spec: SMESpec) -> str:
     """The same for specs whose states, optimal actions and references are the same."""
-    return spec.derive(k=1, r_min=0.0, D=0.0, horizon=1).digest
+    return spec.as_drawn.digest
 
 
 class _Batch(NamedTuple):

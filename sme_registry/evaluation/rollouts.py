@@ -31,6 +31,7 @@ class PlayStep(NamedTuple):
 
     state: Array  # `[B, S]` float64
     distractors: Array  # `[B, m]`
+    noise: Array  # `[B, n + S]` ξ and ζ of the step
     observation: Observation  # `[B, O]`, of all agents
     action: npt.NDArray[Any]  # `[B, A]` as the policy returned it
     running: Mask  # `[B]` whether the episode had not ended before
@@ -50,10 +51,10 @@ def play(
     """
     observation, running = batch.observe(), np.ones(batch.num_envs, bool)
     while running.any():
-        state, distractors = batch.state, batch.distractors
+        state, distractors, noise = batch.state, batch.distractors, batch.noise
         action = act(state, observation)
         result = batch.advance(np.asarray(action, np.float64))
-        yield PlayStep(state, distractors, observation, action, running.copy(), result)
+        yield PlayStep(state, distractors, noise, observation, action, running.copy(), result)
         observation, ended = result.observation, result.terminated | result.truncated
         if begin is None:
             running &= ~ended

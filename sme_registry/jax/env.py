@@ -19,10 +19,12 @@ from jax.custom_batching import custom_vmap
 
 from sme_registry.errors import ActionError, OptionError, StateError
 from sme_registry.jax import task
-from sme_registry.jax.task import TaskParams
+from sme_registry.jax.task import StepNumbers, TaskParams
+from sme_registry.task.task import ON_TOP
 
 Info = dict[str, jax.Array]
 
+_NO_NUMBERS = StepNumbers(None, None)
 _ONE = "Use jax.vmap for several environments."
 
 
@@ -71,10 +73,10 @@ def step(
 def step_env(
     key: jax.Array, state: EnvState, action: jax.Array, params: TaskParams
 ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
-    """`step` without a new episode at the end; only distractors of some tasks need the key.
+    """`step` without a new episode at the end; only distractors and noise need the key.
 
     `info` has `similarity` r̃, `step_reward` r and `regret` 1 − r, `terminated` and `truncated`; of
-    a task with `safety` also `cost` and `safe_regret`.
+    a task with `safety` also `cost` and `safe_regret`; and what is paid on top of R.
     """
     return advance(state, action, task.random_numbers(key, params), params)
 
@@ -84,7 +86,7 @@ reset_env = reset
 
 
 def advance(
-    state: EnvState, action: jax.Array, numbers: jax.Array | None, params: TaskParams
+    state: EnvState, action: jax.Array, numbers: StepNumbers | None, params: TaskParams
 ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
     """`step_env` with the numbers of `task.random_numbers`: nothing in it is random."""
     action = jnp.asarray(action)
@@ -94,6 +96,7 @@ def advance(
             f"action of shape {action.shape}: must be of shape ({params.form.action_dim},). {_ONE}"
         )
     outcome = task.judge(params, state.s, action)
+    numbers = numbers or _NO_NUMBERS
     after = moved(state, action, numbers, params)
 
     total = state.accumulated_reward + outcome.step_reward
@@ -107,16 +110,25 @@ def advance(
         "truncated": truncated,
     }
     reward = jnp.where(paid, total, 0.0)
+    if params.shaping is not None:
+        later = params.shaping.discount * task.potential(params, after.s, after.t)
+        later = jnp.where(terminated, 0.0, later)
+        info["shaping"] = (later - task.potential(params, state.s, state.t)).astype(total.dtype)
+    if params.sigmas is not None and numbers.noise is not None:
+        info["reward_noise"] = (params.sigmas[0] * numbers.noise[0]).astype(total.dtype)
+    for name in ON_TOP:
+        reward = reward + info[name] if name in info else reward
     return observe(after, params), after, reward, terminated | truncated, info
 
 
 def moved(
-    state: EnvState, action: jax.Array, numbers: jax.Array | None, params: TaskParams
+    state: EnvState, action: jax.Array, numbers: StepNumbers | None, params: TaskParams
 ) -> EnvState:
+    numbers = numbers or _NO_NUMBERS
     return state._replace(
-        s=task.next_state(params, state.s, action),
+        s=task.next_state(params, state.s, action, numbers.noise),
         t=state.t + 1,
-        distractors=task.next_distractors(params, state.distractors, action, numbers),
+        distractors=task.next_distractors(params, state.distractors, action, numbers.distractors),
     )
 
 

@@ -215,7 +215,7 @@ def _judged(
 
     zeros = jnp.zeros(n, params.r_min.dtype)
     none = StepOutcome(zeros, zeros, *[zeros if params.form.safety else None] * 2)
-    similarity, reward, *costs = jax.lax.fori_loop(begin // size, -(-end // size), body, none)
+    similarity, reward, *costs, _ = jax.lax.fori_loop(begin // size, -(-end // size), body, none)
     return StepLog(reward, 1.0 - reward, similarity, jnp.zeros_like(truncated), truncated, *costs)
 
 

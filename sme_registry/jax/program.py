@@ -101,7 +101,7 @@ class Lives:
         self._times, self._at_once = first.times, first.switch == "step"
         segments = [*zip(*(drawn[document] for document in documents), strict=True)]
         specs = [task.spec for tasks in segments for task in tasks]
-        self.separable = all(spec.k == 1 and spec.D == 0 for spec in specs)
+        self.separable = all(spec.separable for spec in specs)
         params = {
             tasks: jax.device_put(stacked_params(tasks), device)
             for tasks in dict.fromkeys(segments)

@@ -9,9 +9,12 @@ with `safety`, v another such network:   ℓ(s) = 1 − 2τ v(s)
                                          cost(s, a) = mean_i max(0, a_i − ℓ_i(s)) / (2τ)
 with `observation`, seen for s:          x = M(s, d)
     d' uniform (noise), or ψ(d + u W + b) for u uniform (autonomous) or u = a (driven)
+with `shaping`, a potential:             P_t(s) = c (1 − t/T) φ(s)
+with `noise`, in place of s':            ψ(s + a W + b + σ_s ζ)
 
-Source: METHOD, sections 1, 8 and 9. States and distractors have the bits of `Task`'s. All else is
-in the dtype of the params, within 1e-12 of `Task` in float64, whose order of summation differs.
+Source: METHOD, sections 1, 8 to 10 and 12. States and distractors have the bits of `Task`'s. All
+else is in the dtype of the params, within 1e-12 of `Task` in float64, whose order of summation
+differs.
 Everything but a `Form` is data, so one program serves all draws and all k, T, r_min and D.
 `S` state_dim, `A` action_dim, `L` complexity, `H` hidden_width, `m` distractors.
 """
@@ -37,18 +40,9 @@ from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import Task
 from sme_registry.task.loading import load_task
 
-SUPPORTED_FIELDS = frozenset(
-    (
-        *("schema_version", "seed", "state_dim", "action_dim", "k", "r_min", "D"),
-        *("complexity", "horizon", "hidden_width", "policy_init", "rotation"),
-        *("safety", "observation"),
-    )
-)
-"""Fields of a spec that these modules implement; any other must have its default."""
-
 _UNROLLED = 16  # channels; above it the program would grow with A
 # Uses of a key, which also draws a start from the first places of its stream.
-_OF_START, _OF_STEP = 2**32 - 1, 2**32 - 2
+_OF_START, _OF_STEP, _OF_NOISE = 2**32 - 1, 2**32 - 2, 2**32 - 3
 
 
 @jax.tree_util.register_static
@@ -65,11 +59,19 @@ class Form:
     dynamics: str | None = None
     mixing: str = "none"
     mixing_depth: int | None = None
+    compensated: bool = False
+    shaping: bool = False
+    noise: bool = False
 
     @classmethod
     def of(cls, spec: SMESpec) -> Form:
         width = spec.hidden_width if spec.complexity > 1 else 0
-        form = cls(spec.state_dim, spec.action_dim, spec.complexity, width, spec.safety is not None)
+        form = cls(
+            spec.state_dim, spec.action_dim, spec.complexity, width, spec.safety is not None,
+            compensated=spec.compensated,
+            shaping=spec.shaping is not None,
+            noise=spec.noise is not None,
+        )  # fmt: skip
         seen = spec.observation
         if seen is None:
             return form
@@ -115,6 +117,21 @@ class Observing(NamedTuple):
     mixing: UniformLayer | None
 
 
+class Shaping(NamedTuple):
+    """c and g of a task with `shaping`, and the layer of φ, `W [1, S]` and `b [1]`; float64."""
+
+    scale: jax.Array
+    discount: jax.Array
+    layer: UniformLayer
+
+
+class StepNumbers(NamedTuple):
+    """The random numbers of a step: those of its distractors, and its noise ξ and ζ `[1 + S]`."""
+
+    distractors: jax.Array | None
+    noise: jax.Array | None
+
+
 class TaskParams(NamedTuple):
     """A task; of several tasks, each array has a leading axis.
 
@@ -136,6 +153,8 @@ class TaskParams(NamedTuple):
     form: Form
     limits: Limits | None = None
     observing: Observing | None = None
+    shaping: Shaping | None = None
+    sigmas: jax.Array | None = None  # σ_r and σ_s of a task with `noise`, float64
 
     @property
     def max_steps_in_episode(self) -> jax.Array:
@@ -149,12 +168,16 @@ class TaskParams(NamedTuple):
 
 
 class StepOutcome(NamedTuple):
-    """What actions are worth in their states, `[...]` each; safe_regret is r of π_safe minus r."""
+    """What actions are worth in their states, `[...]` each; safe_regret is r of π_safe minus r.
+
+    `price` is paid on top, in a compensated task.
+    """
 
     similarity: jax.Array
     step_reward: jax.Array
     cost: jax.Array | None = None
     safe_regret: jax.Array | None = None
+    price: jax.Array | None = None
 
 
 def task_params(specs: SpecLike | Sequence[SpecLike], *, dtype: Any = jnp.float64) -> TaskParams:
@@ -188,13 +211,28 @@ def check_supported(document: SMESpec | StreamSpec) -> None:
         _check_switches(document)
 
 
-def next_state(params: TaskParams, s: jax.Array, a: jax.Array) -> jax.Array:
-    """The next states of states `[..., S]` and actions `[..., A]`, exact to the bit."""
-    return transition(params.W, params.b, s, a)
+def next_state(
+    params: TaskParams, s: jax.Array, a: jax.Array, noise: jax.Array | None = None
+) -> jax.Array:
+    """The next states of states `[..., S]` and actions `[..., A]`, exact to the bit.
+
+    `noise` `[1 + S]` is that of the step, where the task has some.
+    """
+    shift = None if params.sigmas is None or noise is None else params.sigmas[1] * noise[1:]
+    return transition(params.W, params.b, s, a, shift)
 
 
-def transition(W: jax.Array, b: jax.Array, s: jax.Array, a: jax.Array) -> jax.Array:
-    """ψ(s + a W + b) of states `[..., S]`, or distractors, and actions `[..., A]`.
+def potential(params: TaskParams, s: jax.Array, t: jax.Array) -> jax.Array:
+    """P_t(s) of a state `[S]` after t steps, in a task with `shaping`."""
+    shaping: Any = params.shaping
+    left = 1.0 - t.astype(jnp.float64) / params.horizon.astype(jnp.float64)
+    return cast("jax.Array", shaping.scale * left * _uniform(shaping.layer, s)[0])
+
+
+def transition(
+    W: jax.Array, b: jax.Array, s: jax.Array, a: jax.Array, shift: jax.Array | None = None
+) -> jax.Array:
+    """ψ(s + a W + b + shift) of states `[..., S]`, or distractors, and actions `[..., A]`.
 
     The sum runs in the order of the definition, and each product is exact, so that it does not
     matter whether a compiler fuses it with its sum.
@@ -208,6 +246,8 @@ def transition(W: jax.Array, b: jax.Array, s: jax.Array, a: jax.Array) -> jax.Ar
         y = lax.fori_loop(
             0, len(W), lambda i, y: y + W[i] * lax.dynamic_slice_in_dim(a, i, 1, axis=-1), y
         )
+    if shift is not None:
+        y = y + shift
     return 2.0 * jnp.abs(y - jnp.rint(y))
 
 
@@ -225,7 +265,8 @@ def judge(params: TaskParams, s: jax.Array, a: jax.Array) -> StepOutcome:
         return StepOutcome(similarities, reward)
     limits = limit(params, s)
     safe = step_reward(params, similarity(params, jnp.minimum(optimal, limits), optimal))
-    return StepOutcome(similarities, reward, cost(params, a, limits), safe - reward)
+    price = 1.0 - safe if params.form.compensated else None
+    return StepOutcome(similarities, reward, cost(params, a, limits), safe - reward, price)
 
 
 def optimal_action(params: TaskParams, s: jax.Array) -> jax.Array:
@@ -272,8 +313,18 @@ def first_distractors(key: jax.Array, params: TaskParams) -> jax.Array | None:
     return uniform_states(jax.random.fold_in(key, _OF_START), params.form.distractors)
 
 
-def random_numbers(key: jax.Array, params: TaskParams) -> jax.Array | None:
-    """Those of a step: the next noise `[m]`, or u `[A]` float32; None where it needs none."""
+def random_numbers(key: jax.Array, params: TaskParams) -> StepNumbers:
+    """Those of a step; None where it needs none."""
+    noise = None
+    if params.form.noise:
+        of_noise = jax.random.fold_in(key, _OF_NOISE)
+        width = (1 + params.form.state_dim,)
+        noise = jax.random.normal(of_noise, width, jnp.float32).astype(jnp.float64)
+    return StepNumbers(_of_distractors(key, params), noise)
+
+
+def _of_distractors(key: jax.Array, params: TaskParams) -> jax.Array | None:
+    """The next noise `[m]`, or u `[A]` float32; None where they need none."""
     if params.form.dynamics not in ("noise", "autonomous"):
         return None
     key = jax.random.fold_in(key, _OF_STEP)
@@ -351,6 +402,12 @@ def _drawn(task: Task, dtype: np.dtype[Any]) -> TaskParams:
         W, b = task.distractor_transition or (None, None)
         mixing = _stacked(task.mixing, dtype) if task.mixing else None
         fields["observing"] = Observing(cast(Any, W), cast(Any, b), mixing)
+    if spec.shaping is not None:
+        scale, discount = map(np.float64, (spec.shaping.scale, spec.shaping.discount))
+        layer = UniformLayer(*cast(Any, task.shaping[0]))
+        fields["shaping"] = Shaping(cast(Any, scale), cast(Any, discount), layer)
+    if spec.noise is not None:
+        fields["sigmas"] = np.array(task.sigmas)
     return TaskParams(**fields)
 
 
@@ -383,17 +440,21 @@ def _check_forms(forms: Sequence[Form]) -> None:
 
 
 def _check_fields(spec: SMESpec) -> None:
-    for name, field in type(spec).model_fields.items():
-        value = getattr(spec, name)
-        if name not in SUPPORTED_FIELDS and value != field.get_default(call_default_factory=True):
-            raise SpecError(
-                f"{name}={short_repr(value)}: must be absent, since tasks in JAX have no {name}. "
-                "Use the environments without JAX, and leave out --agents jax."
-            )
+    if spec.team is not None:
+        raise SpecError(
+            f"team={short_repr(spec.team)}: must be absent, since tasks in JAX have no team. "
+            "Use the environments without JAX, and leave out --agents jax."
+        )
 
 
 def _check_switches(stream: StreamSpec) -> None:
     """Raise SpecError unless every episode ends where a phase is left, or phases switch at once."""
+    shaped = any(spec.shaping is not None for spec in stream.specs)
+    if shaped and stream.switch == "step":
+        raise SpecError(
+            'switch="step": must be "episode", since agents in JAX leave a phase with shaping '
+            "where an episode ends. Use an algorithm of Stable-Baselines3, or change switch."
+        )
     if stream.switch == "step" or len(stream.segments) * stream.cycles == 1:
         return
     otherwise = 'Use an algorithm of Stable-Baselines3, such as PPO, or choose switch="step".'

@@ -3,9 +3,11 @@
 from sme_registry.spec.catalogue import EnvFile, ProtocolFile, StreamFile, StudyFile, SuiteFile
 from sme_registry.spec.sme_spec import (
     AgentSpec,
+    NoiseSpec,
     ObservationSpec,
     SafetySpec,
     Setting,
+    ShapingSpec,
     SMESpec,
     TeamSpec,
 )
@@ -18,12 +20,14 @@ __all__ = [
     "Drift",
     "EnvFile",
     "EvaluationProtocol",
+    "NoiseSpec",
     "ObservationSpec",
     "Phase",
     "ProtocolFile",
     "SMESpec",
     "SafetySpec",
     "Setting",
+    "ShapingSpec",
     "StreamClass",
     "StreamFile",
     "StreamSpec",

@@ -18,7 +18,7 @@ from sme_registry.spec.stream import StreamSpec
 SHORT = len("sha256:") + 12
 """Characters of a digest that name a task."""
 
-_SYMBOL = re.compile(r"^([A-Zθτm]), ")  # with which a description begins
+_SYMBOL = re.compile(r"^(\w(?:_\w)?), ")  # with which a description begins
 BLOCKS: dict[str, type[BaseModel]] = {
     name: kind
     for name, field in Setting.model_fields.items()

@@ -51,15 +51,17 @@ class Fingerprint(StrictModel):
       limit: `[P, A]` ℓ(s); None, and left out of the JSON, without `safety`.
       next_distractors: `[P, m]` T_d(d, a); None, likewise, where they have no transition.
       seen: `[P, S + m]` M(s, d); None, likewise, without a mixing.
+      potential: `[P, 1]` P_0(s); None, likewise, without `shaping`.
     """
 
-    fields_added_later = ("limit", "next_distractors", "seen")
+    fields_added_later = ("limit", "next_distractors", "seen", "potential")
 
     optimal_action: _ROWS
     next_state: _ROWS
     limit: _ROWS | None = None
     next_distractors: _ROWS | None = None
     seen: _ROWS | None = None
+    potential: _ROWS | None = None
 
 
 class Envelope(StrictModel):

@@ -12,7 +12,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence, Sized
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, cast, get_args
 
 import rfc8785
 from pydantic import (
@@ -203,11 +203,20 @@ class _Unquoted(str):
     __repr__ = str.__str__
 
 
+class FieldMark(NamedTuple):
+    """What `Annotated` says of a field, besides its type."""
+
+    text: str
+
+
+LATER = FieldMark("added later")
+"""Of a field that is in no JSON while it has its default: older documents keep their digests."""
+
+
 class StrictModel(BaseModel):
     """Frozen and strict; invalid and unknown fields are errors that say how to correct them."""
 
-    # While these have their default, they are in no JSON: older documents keep their digests.
-    fields_added_later: ClassVar[tuple[str, ...]] = ()
+    fields_added_later: ClassVar[tuple[str, ...]] = ()  # or those that are marked `LATER`
 
     # An instance of a subclass has more fields than its place: equal digests, unequal documents.
     model_config = ConfigDict(
@@ -228,6 +237,7 @@ class StrictModel(BaseModel):
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
         super().__pydantic_init_subclass__(**kwargs)
         before, entries, after = _sections(cls)
+        cls.fields_added_later = cls.marked(LATER) or cls.fields_added_later
         lines = []
         for name, field in cls.model_fields.items():
             field.description = entries.get(name, field.description)
@@ -237,6 +247,11 @@ class StrictModel(BaseModel):
         if cls.__doc__ and lines:
             fields = "Attributes:\n" + "\n".join(lines)
             cls.__doc__ = "\n\n".join(filter(None, (before, fields, after))) + "\n"
+
+    @classmethod
+    def marked(cls, mark: FieldMark) -> tuple[str, ...]:
+        """The fields with a mark, in order."""
+        return tuple(name for name, field in cls.model_fields.items() if mark in field.metadata)
 
     @classmethod
     def __get_pydantic_json_schema__(

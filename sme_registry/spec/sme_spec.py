@@ -19,8 +19,10 @@ from pydantic import (
 )
 
 from sme_registry.spec.document import (
+    LATER,
     WORDED,
     Document,
+    FieldMark,
     Integer,
     NamedDocument,
     Real,
@@ -169,6 +171,8 @@ class SafetySpec(Document):
 
     Attributes:
       tightness: τ, about the share of states and channels in which the optimum is above its limit.
+      compensated: whether each step also pays the price 1 − r of the best safe action. The safe
+        projection is then the best policy that never violates; a violating one may earn more.
 
     Examples:
       >>> from sme_registry.spec import SafetySpec
@@ -177,6 +181,65 @@ class SafetySpec(Document):
     """
 
     tightness: Annotated[Real, Field(gt=0, le=0.5)]
+    compensated: Annotated[bool, LATER] = False
+
+
+class ShapingSpec(Document):
+    """A potential of state and time, whose differences are paid on top and mislead: foresight.
+
+    Source: METHOD, section 10.
+
+    Attributes:
+      scale: c, largest potential, in units of the largest step reward.
+      discount: g, factor of the next potential. With 1 the optimum is that of the undiscounted
+        return; another one is the control of a study, for learners that discount by it.
+
+    Examples:
+      >>> from sme_registry.spec import ShapingSpec
+      >>> sme_registry.SMESpec(shaping=ShapingSpec(scale=3)).shaping.discount
+      1.0
+    """
+
+    scale: Annotated[Real, Field(gt=0, le=100)]
+    discount: Annotated[Real, Field(ge=0, le=1), LATER] = 1.0
+
+
+class NoiseSpec(Document):
+    """Normal noise of what is paid and of the next state; optimum and regret are as without.
+
+    Source: METHOD, section 12. Observations have none: it would hide the state.
+
+    Attributes:
+      reward: σ_r, standard deviation of what is added to the reward of each step.
+      transition: σ_s, standard deviation of what is added to each state channel before the fold.
+
+    Examples:
+      >>> from sme_registry.spec import NoiseSpec
+      >>> sme_registry.SMESpec(noise=NoiseSpec(reward=0.3)).noise.transition
+      0.0
+    """
+
+    reward: Annotated[Real, Field(ge=0, le=10)] = 0.0
+    transition: Annotated[Real, Field(ge=0, le=1)] = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _observations_have_none(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "observation" in data:
+            raise ValueError(
+                "noise.observation: must be left out, because noise of the observation would hide "
+                "the state, and the optimum would not be known. Use reward or transition."
+            )
+        return data
+
+    @model_validator(mode="after")
+    def _some_noise(self) -> Self:
+        if not self.reward and not self.transition:
+            raise ValueError(
+                "reward=0.0: must be above 0 where transition is 0. Increase one of them, or leave "
+                "noise out."
+            )
+        return self
 
 
 class ObservationSpec(Document):
@@ -227,6 +290,10 @@ class ObservationSpec(Document):
         return self
 
 
+PAYMENT = FieldMark("payment")
+"""Of a field that changes what is paid, or for how long, and neither states nor optimum."""
+
+
 class Setting(Document):
     """One setting of the axes: everything that a task is generated from, except its seed.
 
@@ -247,24 +314,27 @@ class Setting(Document):
         cube.
       safety: limits of the actions that depend on the state.
       observation: what the agent sees in place of the state.
+      shaping: a potential whose differences are paid on top, and mislead an agent that does not
+        look ahead.
+      noise: noise of rewards and transitions.
     """
-
-    fields_added_later: ClassVar[tuple[str, ...]] = ("rotation", "safety", "observation")
 
     schema_version: SchemaVersion = 1
     state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, title="state dimension")] = 8
     action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, title="action dimension")] = 4
-    k: Annotated[Integer, Field(ge=1, le=2**31 - 1, title="reward interval")] = 1
-    r_min: Annotated[Real, Field(ge=0, lt=1, title="minimum reward")] = 0.0
-    D: Annotated[Real, Field(ge=0, lt=1, title="survival threshold")] = 0.0
+    k: Annotated[Integer, Field(ge=1, le=2**31 - 1, title="reward interval"), PAYMENT] = 1
+    r_min: Annotated[Real, Field(ge=0, lt=1, title="minimum reward"), PAYMENT] = 0.0
+    D: Annotated[Real, Field(ge=0, lt=1, title="survival threshold"), PAYMENT] = 0.0
     complexity: Annotated[Integer, Field(ge=1, le=10_000)] = 1
-    horizon: Annotated[Integer, Field(ge=1, le=2**31 - 1)] = 100
+    horizon: Annotated[Integer, Field(ge=1, le=2**31 - 1), PAYMENT] = 100
     hidden_width: Annotated[Integer, Field(ge=1, le=4096)] = 64
     policy_init: Literal["semi_orthogonal", "unit_variance"] = "semi_orthogonal"
     team: TeamSpec | None = None
-    rotation: Annotated[Real, Field(ge=0, lt=FULL_TURN)] = 0.0
-    safety: SafetySpec | None = None
-    observation: ObservationSpec | None = None
+    rotation: Annotated[Real, Field(ge=0, lt=FULL_TURN), LATER] = 0.0
+    safety: Annotated[SafetySpec | None, LATER] = None
+    observation: Annotated[ObservationSpec | None, LATER] = None
+    shaping: Annotated[ShapingSpec | None, LATER, PAYMENT] = None
+    noise: Annotated[NoiseSpec | None, LATER, PAYMENT] = None
 
     @field_validator("team")
     @classmethod
@@ -351,14 +421,30 @@ class Setting(Document):
         )
 
     @property
+    def separable(self) -> bool:
+        """Whether r is all that is paid, and it changes no observation and ends no episode."""
+        on_top = self.compensated or self.shaping is not None or self.noise is not None
+        return self.k == 1 and self.D == 0 and not on_top
+
+    @property
     def is_plain(self) -> bool:
-        """Whether a step does no more than METHOD's section 1: no `safety`, no `observation`."""
-        return self.safety is None and self.observation is None
+        """Whether a step does no more than METHOD's section 1."""
+        return (self.safety, self.observation, self.shaping, self.noise) == (None,) * 4
 
     @property
     def tightness(self) -> float:
         """τ, 0 without `safety`: limits that no action exceeds."""
         return 0.0 if self.safety is None else self.safety.tightness
+
+    @property
+    def compensated(self) -> bool:
+        """Whether each step pays the price of the best safe action."""
+        return self.safety is not None and self.safety.compensated
+
+    @property
+    def reward_noise(self) -> float:
+        """σ_r, 0 without `noise`."""
+        return 0.0 if self.noise is None else self.noise.reward
 
     @property
     def distractors(self) -> int:
@@ -449,9 +535,18 @@ class SMESpec(Setting, NamedDocument):
         """Its only segment."""
         return (Segment(0, self, 0),)
 
+    @property
+    def as_drawn(self) -> SMESpec:
+        """This spec with the default payment: equal where states and optimal actions are."""
+        return self.model_copy(update={name: _default(name) for name in self.marked(PAYMENT)})
+
     def derive(self, **overrides: Any) -> SMESpec:
         """This spec with some fields changed: another task, with another digest."""
         return SMESpec.from_dict({**self.to_dict(), **overrides}) if overrides else self
+
+
+def _default(name: str) -> Any:
+    return Setting.model_fields[name].default
 
 
 SpecLike: TypeAlias = SMESpec | dict[str, Any] | str | os.PathLike[str]

@@ -117,7 +117,7 @@ class Programs:
             cell.evaluations,
             cell.evaluation_episodes,
             # Rewards that change no observation and end no episode are computed in another way.
-            all(spec.k == 1 and spec.D == 0 for spec in cell.specs),
+            all(spec.separable for spec in cell.specs),
             _forms(cell),
             cell.document.switches,
         )

@@ -73,6 +73,17 @@ def mixed_bits(z: Bits) -> Bits:
     return z ^ (z >> np.uint64(31))
 
 
+def normal_of_steps(key: Bits, name: str, steps: Array, width: int) -> Array:
+    """Standard normal numbers `[n, width]`, of float32, of streams with a name.
+
+    They depend on the name, each environment's key, and how many `steps` `[n]` it has drawn for.
+    """
+    word = int.from_bytes(hashlib.sha256(f"sme-v1/{name}".encode()).digest()[:8], "little")
+    first = steps.astype(np.uint64) * np.uint64(width) + np.uint64(1)
+    numbers = counted(mixed_bits(key ^ np.uint64(word)), first, width)
+    return np.asarray(ndtri(numbers).astype(np.float32).astype(np.float64))
+
+
 GRID_BITS = 29  # 29 bits of W times 24 of a float32 action fit the 53 of a float64
 
 
@@ -127,6 +138,14 @@ def limiting_network(spec: SMESpec) -> tuple[Layer, ...]:
         return ()
     everything = tuple(range(spec.state_dim))
     return _network(spec, "safety", everything, spec.action_dim)
+
+
+def potential_layers(spec: SMESpec) -> tuple[Layer, ...]:
+    """The layer of φ(s) = Φ(√12 wᵀ (s − ½)), w uniform on the sphere; none without `shaping`."""
+    if spec.shaping is None:
+        return ()
+    W = math.sqrt(12.0) * _haar(spec.seed, "shaping", spec.state_dim, 1).T
+    return (Layer(W, -0.5 * W.sum(axis=1)),)
 
 
 def distractor_transition(spec: SMESpec) -> tuple[Array, Array] | None:

@@ -38,6 +38,7 @@ from sme_registry.task.task import (
     Indices,
     Mask,
     Observation,
+    own_rows,
 )
 
 Backend = Literal["numba", "numpy"]
@@ -131,7 +132,7 @@ def compiling() -> Iterator[None]:
 
     Numba keeps what it compiled next to this package or in NUMBA_CACHE_DIR: once for each version.
     """
-    timer = threading.Timer(_PATIENCE, print, [_NOTICE], {"file": sys.stderr, "flush": True})
+    timer = threading.Timer(_PATIENCE, _say_once)
     timer.daemon = True
     if sys.stderr is not None and (sys.stderr.isatty() or "ipykernel" in sys.modules):
         timer.start()
@@ -139,6 +140,11 @@ def compiling() -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+@functools.cache
+def _say_once() -> None:
+    print(_NOTICE, file=sys.stderr, flush=True)
 
 
 def machine_code(function: Any, signature: Any) -> Callable[..., Any]:
@@ -168,19 +174,22 @@ def _numba_engine(task: Task) -> Engine:
 
     if task not in _packed:
         _packed[task] = kernels.pack(task)
-    packed = _packed[task]
+    packed, parts = _packed[task], kernels.parts(task)
     is_small = packed.size <= SMALL
     prefix = packed if is_small else packed[:0]
 
     @functools.cache
     def step_one(dtype: np.dtype[Any]) -> StepOne:
         if is_small:
-            return machine_code(kernels.step_packed, kernels.STEP_PACKED[dtype])
-        return functools.partial(machine_code(kernels.step_one, kernels.STEP_ONE[dtype]), packed)
+            entry = machine_code(kernels.step_packed, kernels.step_packed_of(parts, dtype))
+            return functools.partial(entry, *parts)
+        entry = machine_code(kernels.step_one, kernels.step_one_of(parts, dtype))
+        return functools.partial(entry, *parts, packed)
 
     @functools.cache
     def step_many() -> StepMany:
-        return functools.partial(machine_code(kernels.step_many, kernels.STEP_MANY), packed)
+        entry = machine_code(kernels.step_many, kernels.step_many_of(parts))
+        return functools.partial(entry, *parts, packed)
 
     start, size = prefix.size, kernels.buffer_size(packed)
 
@@ -189,6 +198,7 @@ def _numba_engine(task: Task) -> Engine:
         return buffer, buffer[start : start + _entries(task)]
 
     def optimal_action(s: Array) -> Array:
+        add_and_normal_cdf = machine_code(kernels.add_and_normal_cdf, kernels.ADD_AND_NORMAL_CDF)
         out = np.empty((len(s), task.spec.action_dim))
         for first in range(0, len(s), _BLOCK):
             block, channel = s[first : first + _BLOCK], 0
@@ -196,7 +206,7 @@ def _numba_engine(task: Task) -> Engine:
                 x = block if len(channels) == task.spec.state_dim else block[:, channels]
                 for W, b in layers:
                     x = x @ W.T  # BLAS for the product, compiled code for Φ, which is the cost
-                    kernels.add_and_normal_cdf(x, b)
+                    add_and_normal_cdf(x, b)
                 out[first : first + _BLOCK, channel : channel + x.shape[1]] = x
                 channel += x.shape[1]
         return out
@@ -245,15 +255,17 @@ def _numpy_engine(task: Task) -> Engine:
     ) -> bool:
         if not np.isfinite(action).all():
             return False
-        result = step(task, np.ascontiguousarray(s.T), t, accumulated.T, action)
+        noise = own[OWN_DISTRACTORS + m + 1 :].T if task.spec.noise is not None else None
+        result = step(task, np.ascontiguousarray(s.T), t, accumulated.T, action, noise)
         result.write(actions, values)
         accumulated[:] = result.accumulated_reward.T
         ends[:] = result.terminated, result.truncated
         t += 1
         moved[:] = result.state.T
         if m:
-            own[OWN_DISTRACTORS:] = _next_distractors(task, own, np.clip(action, 0.0, 1.0)).T
-        observation[:, : S + m] = seen(np.concatenate([moved, own[OWN_DISTRACTORS:]])).T
+            d = own[OWN_DISTRACTORS:][:m]
+            d[:] = _next_distractors(task, own, d.T, np.clip(action, 0.0, 1.0)).T
+        observation[:, : S + m] = seen(np.concatenate([moved, own[OWN_DISTRACTORS:][:m]])).T
         observation[:, S + m] = t / task.spec.horizon
         waiting = np.minimum(result.accumulated_reward / task.spec.k, 1.0)
         observation[:, S + m + 1 :][:, : waiting.shape[1]] = waiting  # a stream appends its phase
@@ -268,15 +280,15 @@ def _numpy_engine(task: Task) -> Engine:
 
 def _entries(task: Task) -> int:
     """The entries of a single environment that `task.task` names."""
-    return BUFFER_STATE + task.spec.state_dim + OWN_DISTRACTORS + task.spec.distractors
+    return BUFFER_STATE + task.spec.state_dim + own_rows(task.spec)
 
 
-def _next_distractors(task: Task, own: Array, action: Array) -> Array:
+def _next_distractors(task: Task, own: Array, d: Array, action: Array) -> Array:
     if task.distractor_transition is None:
         return draw(own, task.spec.distractors)
     if task.spec.dynamics == "autonomous":
         action = draw(own, task.spec.action_dim)
-    return task.distractor_step(own[OWN_DISTRACTORS:].T, action)
+    return task.distractor_step(d, action)
 
 
 def _network_with_numpy(layers: Sequence[Layer], uniform: bool, x: Array) -> Array:

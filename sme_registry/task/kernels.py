@@ -9,14 +9,16 @@ environments, channel by channel, so that the inner loop is long enough to fill 
 A task travels as one flat float64 array, because each array argument costs a call 40 ns:
     S, A, k, T, r_min, D, agents, widest layer, size of all this, pays the team (0 or 1),
     m, τ (0 without safety), how distractors move (an index of `_DYNAMICS`), whether layers of the
-    mixing end with Φ (0 or 1), how many layers limit, how many mix,
+    mixing end with Φ (0 or 1), how many layers limit, how many mix, an environment's own numbers,
+    c and g of the shaping, σ_r, σ_s, whether the price is paid (0 or 1),
     W [A, S], b [S], for each agent
     inputs, L, observed channels [inputs], for each layer  in, out, W transposed [in, out], b [out],
-    the limiting layers, W [A, m] and b [m] of distractors with a transition, the mixing layers.
+    the limiting layers, W [A, m] and b [m] of distractors with a transition, the mixing layers,
+    W [S] and b of φ.
 The buffer of a single environment follows it in the same array where the task is small (another
 40 ns), and stands alone where it is not, so that environments can share it:
-    t, the values of the last step [7] (`task.NUMBERS`; r_cum is among them), s [S],
-    its own distractors [2 + m], room for two layers [2 × widest].
+    t, the values of the last step [10] (`task.NUMBERS`; r_cum is among them), s [S],
+    its own numbers (`task.own_rows`), room for two layers [2 × widest].
 
 Numba's disk cache does not know a function's flags: never compile one of these a second way.
 """
@@ -25,6 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,16 +47,20 @@ from sme_registry.task.task import (
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
+    PRICE,
     REGRET,
     REWARD,
+    REWARD_NOISE,
     SAFE_REGRET,
+    SHAPING,
     SIMILARITY,
     STEP_REWARD,
     Array,
+    own_rows,
 )
 
 _BLOCK_NUMBERS = 4096  # of one layer's block: 32 KiB, so that a block stays in cache
-_HEADER = 16
+_HEADER = 22
 _NARROW = 16  # below it a matrix product over rows beats the vectorised one over columns
 _DYNAMICS = None, "noise", "autonomous", "driven"
 _NOISE, _AUTONOMOUS, _DRIVEN = 1, 2, 3
@@ -61,13 +68,16 @@ _NOISE, _AUTONOMOUS, _DRIVEN = 1, 2, 3
 
 def pack(task: Task) -> Array:
     spec, networks = task.spec, (*task.policies, task.limiting, task.mixing)
+    shaping = spec.shaping
     dynamics, uniform = _DYNAMICS.index(spec.dynamics), spec.mixing == "nonlinear"
     sides = (side for layers in networks for W, _ in layers for side in W.shape)
     widest = max(spec.state_dim + spec.distractors, *sides)
     parts: list[npt.ArrayLike] = [
         [spec.state_dim, spec.action_dim, spec.k, spec.horizon, spec.r_min, spec.D],
         [len(task.policies), widest, 0.0, task.pays_the_team, spec.distractors, spec.tightness],
-        [dynamics, uniform, len(task.limiting), len(task.mixing)],
+        [dynamics, uniform, len(task.limiting), len(task.mixing), own_rows(spec)],
+        [shaping.scale, shaping.discount] if shaping is not None else [0.0, 0.0],
+        [*task.sigmas, spec.compensated],
         task.W.ravel(),
         task.b,
     ]
@@ -76,6 +86,7 @@ def pack(task: Task) -> Array:
     parts += _layer_parts(task.limiting)
     parts += [array.ravel() for array in task.distractor_transition or ()]
     parts += _layer_parts(task.mixing)
+    parts += [array.ravel() for layer in task.shaping for array in layer]
     packed = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
     packed[8] = packed.size
     return packed
@@ -94,7 +105,7 @@ def _layer_parts(layers: Sequence[Layer]) -> list[npt.ArrayLike]:
 
 def buffer_size(packed: Array) -> int:
     """The size of a single environment's own part."""
-    return BUFFER_STATE + int(packed[0]) + OWN_DISTRACTORS + int(packed[10]) + 2 * int(packed[7])
+    return BUFFER_STATE + int(packed[0]) + int(packed[16]) + 2 * int(packed[7])
 
 
 # Φ, the standard normal CDF, by a table of polynomials: several times the speed of `erfc`, whose
@@ -299,7 +310,19 @@ def _one_limits(p, at, buffer, s, x, y, values, action, actions):  # type: ignor
     safe_reward = _reward_of(1.0 - missed / float64(A), p[4])
     step_reward = buffer[values + np.uint64(STEP_REWARD)]
     buffer[values + np.uint64(SAFE_REGRET)] = safe_reward - step_reward
+    buffer[values + np.uint64(PRICE)] = p[21] * (1.0 - safe_reward)
     return at
+
+
+@njit(inline="always", error_model="numpy")
+def _one_potential(p, buffer, s, t):  # type: ignore[no-untyped-def]
+    """P_t(s); the layer of φ ends a packed task."""
+    S = np.uint64(p[0])
+    b = np.uint64(p[8]) - _U1
+    total = p[b]
+    for j in range(S):
+        total = total + p[b - S + j] * buffer[s + j]
+    return p[17] * (1.0 - t / p[3]) * normal_cdf(total)
 
 
 @njit(error_model="numpy")
@@ -344,7 +367,7 @@ def _one_seen(p, at, buffer, s, d, x, y, observation):  # type: ignore[no-untype
 
 
 @njit(error_model="numpy")
-def _one_step(p, buffer, start, action, actions, observation):  # type: ignore[no-untyped-def]
+def _one_step(limited, observed, shaped, noisy, p, buffer, start, action, actions, observation):  # type: ignore[no-untyped-def]
     """One step of the environment whose own numbers begin at `buffer[start]`; see `step_one`."""
     S, A, k, T = np.uint64(p[0]), np.uint64(p[1]), int(p[2]), int(p[3])
     r_min, D, widest, m = p[4], p[5], np.uint64(p[7]), np.uint64(p[10])
@@ -356,7 +379,7 @@ def _one_step(p, buffer, start, action, actions, observation):  # type: ignore[n
 
     values, s = start + _VALUES, start + _STATE
     own = s + S
-    x = own + _OWN_D + m
+    x = own + np.uint64(p[16])
     y = x + widest
     b = np.uint64(_HEADER) + A * S
     at = b + S
@@ -376,29 +399,44 @@ def _one_step(p, buffer, start, action, actions, observation):  # type: ignore[n
     buffer[values + np.uint64(SIMILARITY)] = similarity
     buffer[values + np.uint64(STEP_REWARD)] = step_reward
     buffer[values + np.uint64(REGRET)] = 1.0 - step_reward
-    if p[11] > 0.0:
+    if limited is not None:
         at = _one_limits(p, at, buffer, s, x, y, values, action, actions)
+    t = int(buffer[start + _T])
+    potential = 0.0
+    if shaped is not None:
+        potential = _one_potential(p, buffer, s, t)
+    noise = own + _OWN_D + m + _U1
 
     for j in range(S):
         moved = buffer[s + j] + p[b + j]
         for i in range(A):
             a = _clipped(float64(float32(action[i])))
             moved = moved + p[np.uint64(_HEADER) + i * S + j] * a
+        if noisy is not None:
+            moved = moved + p[20] * buffer[noise + _U1 + j]
         folded = 2.0 * abs(moved - np.rint(moved))
         buffer[s + j] = folded
         observation[j] = folded
-    if p[12] > 0.0:
+    if observed is not None:
         at = _one_distractors(p, at, buffer, own, x, action)
-    if p[10] + p[15] > 0.0:
         _one_seen(p, at, buffer, s, own + _OWN_D, x, y, observation)
 
-    t = int(buffer[start + _T]) + 1
+    t += 1
     accumulated = buffer[values + np.uint64(ACCUMULATED_REWARD)] + step_reward
     truncated = t >= T
     end = (1.0 if step_reward < D else 0.0) + (2.0 if truncated else 0.0)
     reward = 0.0
     if truncated or t % k == 0:
         reward, accumulated = accumulated, 0.0
+    if limited is not None:
+        reward += buffer[values + np.uint64(PRICE)]
+    if shaped is not None:
+        later = 0.0 if step_reward < D else p[18] * _one_potential(p, buffer, s, t)
+        buffer[values + np.uint64(SHAPING)] = later - potential
+        reward += later - potential
+    if noisy is not None:
+        buffer[values + np.uint64(REWARD_NOISE)] = p[19] * buffer[noise]
+        reward += p[19] * buffer[noise]
     buffer[start + _T] = t
     buffer[values + np.uint64(REWARD)] = reward
     buffer[values + np.uint64(ACCUMULATED_REWARD)] = accumulated
@@ -408,21 +446,36 @@ def _one_step(p, buffer, start, action, actions, observation):  # type: ignore[n
     return reward, end
 
 
+# Of a step, by the dtype of its actions; `engine.machine_code` compiles what is asked for.
 _RESULT = types.UniTuple(float64, 2)
+_ACTIONS = {np.dtype(np.float32): float32[:], np.dtype(np.float64): float64[:]}
 _REST = (float64[::1], float32[::1])
-# By the dtype of the actions; compiled when they are asked for, by `engine.machine_code`.
-STEP_ONE = {
-    np.dtype(np.float32): _RESULT(_PACKED, float64[::1], float32[:], *_REST),
-    np.dtype(np.float64): _RESULT(_PACKED, float64[::1], float64[:], *_REST),
-}
-STEP_PACKED = {
-    np.dtype(np.float32): _RESULT(float64[::1], float32[:], *_REST),
-    np.dtype(np.float64): _RESULT(float64[::1], float64[:], *_REST),
-}
+
+
+def parts(task: Task) -> tuple[bool | None, ...]:
+    """The first arguments of a task's steps: True for each part of a step that it has, or None.
+
+    Numba compiles no branch on None: what a task does not have costs no time to compile.
+    """
+    spec = task.spec
+    blocks = spec.safety, spec.observation, spec.shaping, spec.noise
+    return tuple(None if block is None else True for block in blocks)
+
+
+def _types_of(parts: Sequence[bool | None]) -> Any:
+    return [types.none if part is None else types.boolean for part in parts]
+
+
+def step_one_of(parts: Sequence[bool | None], action: np.dtype[Any]) -> Any:
+    return _RESULT(*_types_of(parts), _PACKED, float64[::1], _ACTIONS[action], *_REST)
+
+
+def step_packed_of(parts: Sequence[bool | None], action: np.dtype[Any]) -> Any:
+    return _RESULT(*_types_of(parts), float64[::1], _ACTIONS[action], *_REST)
 
 
 @njit(error_model="numpy", cache=True)
-def step_one(p, buffer, action, actions, observation):  # type: ignore[no-untyped-def]
+def step_one(limited, observed, shaped, noisy, p, buffer, action, actions, observation):  # type: ignore[no-untyped-def]
     """One step of one environment of a single agent.
 
     `p` is the packed task, and `buffer` the environment's own numbers, advanced in place. `action`
@@ -432,13 +485,16 @@ def step_one(p, buffer, action, actions, observation):  # type: ignore[no-untype
     Returns `(reward, end)`; end is 1 for terminated plus 2 for truncated, or −1 where the action is
     of another size or not finite: nothing has moved then.
     """
-    return _one_step(p, buffer, _U0, action, actions, observation)
+    return _one_step(limited, observed, shaped, noisy, p, buffer, _U0, action, actions, observation)
 
 
 @njit(error_model="numpy", cache=True)
-def step_packed(buffer, action, actions, observation):  # type: ignore[no-untyped-def]
+def step_packed(limited, observed, shaped, noisy, buffer, action, actions, observation):  # type: ignore[no-untyped-def]
     """`step_one` for an environment whose own numbers follow its packed task in one array."""
-    return _one_step(buffer, buffer, np.uint64(buffer[8]), action, actions, observation)
+    start = np.uint64(buffer[8])
+    return _one_step(
+        limited, observed, shaped, noisy, buffer, buffer, start, action, actions, observation
+    )
 
 
 @njit(inline="always", error_model="numpy")
@@ -589,7 +645,7 @@ def _block_distance(action, first, count, best, owner, distance, acted, actions)
 
 
 @njit(inline="always", error_model="numpy")
-def _block_transition(W, b, s, first, count, acted, column, moved, observation):  # type: ignore[no-untyped-def]
+def _block_transition(W, b, s, first, count, acted, column, noisy, p, own, moved, observation):  # type: ignore[no-untyped-def]
     """ψ(s + a W + b) of a block, into `moved` `[S, B]` and `observation` `[B, …]`.
 
     The sum runs over the action channels in ascending order, four at a time, in `column` `[block]`.
@@ -615,6 +671,10 @@ def _block_transition(W, b, s, first, count, acted, column, moved, observation):
             for env in range(count):
                 column[env] = column[env] + w * acted[i0, env]
             i += 1
+        if noisy is not None:
+            row = own.shape[0] - S + j
+            for env in range(count):
+                column[env] = column[env] + p[20] * own[row, first + env]
         for env in range(count):
             folded = 2.0 * abs(column[env] - np.rint(column[env]))
             moved[j, first + env] = folded
@@ -703,6 +763,54 @@ def _block_limits(p, first, count, action, best, v, excess, missed, actions, val
         values[COST, 0, first + env] = excess[env] / (2.0 * tightness * float64(A))
         safe_reward = _reward_of(1.0 - missed[env] / float64(A), r_min)
         values[SAFE_REGRET, 0, first + env] = safe_reward - values[STEP_REWARD, 0, first + env]
+        if p[21] == 1.0:
+            values[PRICE, 0, first + env] = 1.0 - safe_reward
+            values[REWARD, 0, first + env] += 1.0 - safe_reward
+
+
+@njit(inline="always", error_model="numpy")
+def _block_potential(p, s, first, count, t, later, cells, column):  # type: ignore[no-untyped-def]
+    """P of states `[S, B]` that are `later` steps after t, of a block, into `column`."""
+    S = int(p[0])
+    W = int(p[8]) - 1 - S
+    for env in range(count):
+        column[env] = p[W + S]
+    for j in range(S):
+        w = p[W + j]
+        for env in range(count):
+            column[env] = column[env] + w * s[j, first + env]
+    for env in range(count):
+        cells[env], column[env] = cell_of(column[env])
+    for env in range(count):
+        left = 1.0 - (t[first + env] + later) / p[3]
+        column[env] = p[17] * left * in_cell(cells[env], column[env])
+
+
+@njit(inline="always", error_model="numpy")
+def _block_shaping(p, s, moved, first, count, t, cells, before, after, values, ends):  # type: ignore[no-untyped-def]
+    """F of a block, and its payment to every agent."""
+    _block_potential(p, s, first, count, t, 0, cells, before)
+    _block_potential(p, moved, first, count, t, 1, cells, after)
+    for env in range(count):
+        later = 0.0 if ends[0, first + env] else p[18] * after[env]
+        after[env] = later - before[env]
+    for agent in range(values.shape[1]):
+        for env in range(count):
+            values[SHAPING, agent, first + env] = after[env]
+            values[REWARD, agent, first + env] += after[env]
+
+
+@njit(inline="always", error_model="numpy")
+def _block_reward_noise(p, own, first, count, values):  # type: ignore[no-untyped-def]
+    """The noise of each agent's reward in a block."""
+    agents = values.shape[1]
+    row = own.shape[0] - int(p[0]) - agents
+    for agent in range(agents):
+        for env in range(first, first + count):
+            noise = p[19] * own[row + agent, env]
+            if values.shape[0] > REWARD_NOISE:
+                values[REWARD_NOISE, agent, env] = noise
+            values[REWARD, agent, env] += noise
 
 
 @njit(inline="always", error_model="numpy")
@@ -764,39 +872,38 @@ def _block_seen(p, at, moved, own, first, count, x, y, cells, observation):  # t
             observation[first + env, j] = x[j, env]
 
 
-STEP_MANY = boolean(
-    _PACKED,
-    float64[:, ::1],
-    int64[::1],
-    float64[:, ::1],
-    float64[:, ::1],
-    float64[:, ::1],
-    float64[:, ::1],
-    float32[:, ::1],
-    float64[:, :, ::1],
-    float64[:, :, ::1],
-    boolean[:, ::1],
-)
+_BATCH = (
+    _PACKED, float64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1],
+    float64[:, ::1], float32[:, ::1], float64[:, :, ::1], float64[:, :, ::1], boolean[:, ::1],
+)  # fmt: skip
+
+
+def step_many_of(parts: Sequence[bool | None]) -> Any:
+    return boolean(*_types_of(parts), *_BATCH)
 
 
 @njit(error_model="numpy", cache=True)
-def step_many(p, s, t, accumulated, own, action, moved, observation, actions, values, ends):  # type: ignore[no-untyped-def]
+def step_many(  # type: ignore[no-untyped-def]
+    limited, observed, shaped, noisy,
+    p, s, t, accumulated, own, action, moved, observation, actions, values, ends,
+):  # fmt: skip
     """One step of `B` environments of a team of n agents; a single agent is a team of one.
 
     They are stepped in blocks that fit in cache: π*, its distance from the action, the transition,
-    the rewards, the payouts, and what `safety` and `observation` add.
+    the rewards, the payouts, and what `parts` add.
 
     Args:
+      limited, observed, shaped, noisy: see `parts`.
       p: the packed task.
       s: `[S, B]` states, channel by channel.
       t: `[B]` steps completed before this one; advanced in place.
       accumulated: `[n, B]` each agent's r_cum; advanced in place.
-      own: `[2 + m, B]` the key, numbers drawn, and distractors of each; advanced in place.
+      own: the own numbers of each, `[own_rows, B]`; advanced in place.
       action: `[B, A]`, clipped here.
       moved: `[S, B]`, written: the next states.
       observation: `[B, …]`, of which is written: M(s, d), t/T, and each agent's r_cum/k.
       actions: `[1 or 3, B, A]`, written: π* of the states acted in, the limits, the safe actions.
-      values: `[5 or 7, n, B]`, written: the rows of `task.task`.
+      values: `[5 … 10, n, B]`, written: the rows of `task.task`.
       ends: `[2, B]`, written: terminated, truncated.
 
     Returns:
@@ -818,18 +925,22 @@ def step_many(p, s, t, accumulated, own, action, moved, observation, actions, va
         x, y = room, other
         behind = _block_policy(p, s, first, count, x, y, cells, best, owner, owned)
         _block_distance(action, first, count, best, owner, distance, acted, actions)
-        _block_transition(W, b, s, first, count, acted, column, moved, observation)
+        _block_transition(W, b, s, first, count, acted, column, noisy, p, own, moved, observation)
         finite &= _block_rewards(p, first, count, distance, owned, second, values, ends)
         _block_payout(p, first, count, t, accumulated, column, values, ends, observation)
-        if p[11] > 0.0:
+        if limited is not None:
             for j in range(S):
                 for env in range(count):
                     x[j, env] = s[j, first + env]
             x, y, behind, _ = _block_layers(p, behind, int(p[14]), x, y, cells, count, True)
             _block_limits(p, first, count, action, best, x, column, second, actions, values)
+        if shaped is not None:
+            _block_shaping(p, s, moved, first, count, t, cells, column, second, values, ends)
+        if noisy is not None:
+            _block_reward_noise(p, own, first, count, values)
     if not finite:
         return False
-    if p[10] + p[15] > 0.0:
+    if observed is not None:
         for first in range(0, t.size, block):
             count = min(block, t.size - first)
             at = _block_distractors(p, behind, own, first, count, action, acted, start, column)
@@ -862,7 +973,10 @@ def network(p, s, uniform, out):  # type: ignore[no-untyped-def]
                 out[o, first + env] = x[o, env]
 
 
-@njit(void(float64[:, ::1], _PACKED), error_model="numpy", cache=True)
+ADD_AND_NORMAL_CDF = void(float64[:, ::1], _PACKED)
+
+
+@njit(error_model="numpy", cache=True)
 def add_and_normal_cdf(x, b):  # type: ignore[no-untyped-def]
     """x ← Φ(x + b) in place, `[B, out]` and `[out]`: the step after a matrix product."""
     cells = np.empty(b.size, np.int32)

@@ -163,6 +163,7 @@ def _draw(spec: SMESpec) -> Task:
         draw.limiting_network(spec),
         draw.distractor_transition(spec),
         draw.mixing_layers(spec),
+        draw.potential_layers(spec),
     )
     for array in task.arrays:
         array.setflags(write=False)
@@ -196,6 +197,8 @@ def fingerprint_of(task: Task) -> Fingerprint:
         numbers["next_distractors"] = task.distractor_step(distractors, actions)
     if task.mixing:
         numbers["seen"] = task.seen(states, distractors)
+    if task.shaping:
+        numbers["potential"] = task.potential(states, 0)[:, None]
     return Fingerprint(**{name: np.round(x, _DECIMALS).tolist() for name, x in numbers.items()})
 
 

@@ -17,6 +17,13 @@ With `safety` (METHOD, section 8), v another such network and τ its tightness:
 With `observation` (METHOD, section 9) the agent sees x = M(s, d) in place of s, of distractors d
 that move by a transition of their own, and an invertible map M.
 
+With `shaping` (METHOD, section 10), c its scale, g its discount, and one uniform layer φ:
+
+    P_t(s) = c (1 − t/T) φ(s)                           potential, 0 after a termination
+
+With `noise` (METHOD, section 12), ξ and ζ standard normal, and σ_r and σ_s of float32, T(s, a) is
+ψ(s + a W + b + σ_s ζ).
+
 One step of `B` episodes of n agents, sections 1 and 5 (a single agent is a team of one; t completed
 steps, T horizon). Agent i's r_i follows from r̃ over its own channels, or over all where the team is
 paid:
@@ -25,6 +32,7 @@ paid:
     terminated = any r_i < D   truncated = t ≥ T
     R = r_cum where k divides t or truncated, else 0;  r_cum ← 0 after a payout
     observation = (s, t/T, r_cum/k of each agent), after the step
+    reward = R + (1 − r(s, a_safe) if compensated) + g P_t(s_t) − P_{t−1}(s_{t−1}) + σ_r ξ
 
 On termination alone nothing extra is paid; the lost reward stays visible as r_cum.
 
@@ -69,19 +77,32 @@ NUMBERS = {
     "accumulated_reward": "",
     "cost": "safety",
     "safe_regret": "safety",
+    "price": "compensated",
+    "shaping": "shaping",
+    "reward_noise": "reward_noise",
 }
-"""What one step computes for n agents in B environments, the rows of `values` `[5 or 7, n, B]`; and
-the field of the spec without which a task has no such number."""
-SIMILARITY, STEP_REWARD, REGRET, REWARD, ACCUMULATED_REWARD, COST, SAFE_REGRET = range(len(NUMBERS))
+"""What one step computes for n agents in B environments, the rows of `values` `[5 … 10, n, B]`; and
+the attribute of the spec without which a task has no such number."""
+SIMILARITY, STEP_REWARD, REGRET, REWARD, ACCUMULATED_REWARD = range(5)
+COST, SAFE_REGRET, PRICE, SHAPING, REWARD_NOISE = range(5, len(NUMBERS))
+
+ON_TOP = "price", "shaping", "reward_noise"
+"""What is paid on top of the payout R."""
 
 ACTIONS = {"optimal_action": "", "limit": "safety", "safe_action": "safety"}
 """The rows of `actions` `[1 or 3, B, A]`, likewise."""
 
 # A single environment is one buffer: t, the values of its last step, of which it keeps r_cum, the
-# state s `[S]`, and its own distractors: the key of their random numbers, how many it has drawn,
-# and d `[m]`.
+# state s `[S]`, and its own random numbers: their key, how many its distractors have drawn, and
+# d `[m]`; and the noise of the next step: how many have drawn it before, ξ `[n]` and ζ `[S]`.
 BUFFER_T, BUFFER_VALUES, BUFFER_STATE = 0, 1, 1 + len(NUMBERS)
 OWN_KEY, OWN_DRAWN, OWN_DISTRACTORS = range(3)
+
+
+def own_rows(spec: SMESpec) -> int:
+    """How many numbers an environment has of its own: OWN_KEY and those after it."""
+    return OWN_DISTRACTORS + spec.distractors + 1 + len(spec.agents) + spec.state_dim
+
 
 _LARGEST = 1e300  # beyond it W s could overflow, and π* be NaN
 
@@ -99,6 +120,7 @@ class Task:
       limiting: the layers of v; empty without `safety`.
       distractor_transition: W `[A, m]` and b `[m]` of autonomous and driven distractors; else None.
       mixing: the layers of M, from `[S + m]` to `[S + m]`; empty without a mixing.
+      shaping: the layer of φ; empty without `shaping`.
 
     Examples:
       >>> task = sme_registry.materialize(sme_registry.SMESpec())
@@ -118,6 +140,7 @@ class Task:
     limiting: tuple[Layer, ...] = ()
     distractor_transition: tuple[Array, Array] | None = None
     mixing: tuple[Layer, ...] = ()
+    shaping: tuple[Layer, ...] = ()
 
     def __repr__(self) -> str:
         return f"<Task of {self.spec!r}>"
@@ -125,7 +148,7 @@ class Task:
     @property
     def arrays(self) -> Iterator[Array]:
         yield from (self.W, self.b, *(self.distractor_transition or ()))
-        for layers in (*self.policies, self.limiting, self.mixing):
+        for layers in (*self.policies, self.limiting, self.mixing, self.shaping):
             for layer in layers:
                 yield from layer
 
@@ -153,14 +176,24 @@ class Task:
         """Whether every agent is paid for the mean similarity over all channels."""
         return self.spec.team is not None and self.spec.team.reward == "team"
 
-    def transition(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """σ_r and σ_s, of float32, so that products with float32 numbers are exact; or 0."""
+        noise = self.spec.noise
+        return (0.0, 0.0) if noise is None else (_rounded(noise.reward), _rounded(noise.transition))
+
+    def transition(
+        self, s: npt.ArrayLike, a: npt.ArrayLike, noise: npt.ArrayLike | None = None
+    ) -> Array:
         """The next state ψ(s + a W + b), `[B, S]` or `[S]` in [0, 1].
 
         The sum runs in a fixed order (s + b, then W_i a_i for i = 1…A) over actions rounded to
-        float32, which makes each product exact: so every back-end gets the same bits.
+        float32, which makes each product exact: so every back-end gets the same bits. `noise` is ζ,
+        of the shape of the states; None is 0, the transition without noise.
         """
         s, a = self._pairs(s, a)
-        return _moved(s, a, self.W, self.b)
+        shift = None if noise is None else self.sigmas[1] * self._states(noise)
+        return _moved(s, a, self.W, self.b, shift)
 
     def optimal_action(self, s: npt.ArrayLike) -> Array:
         """π*(s), the unique action of regret 0: `[B, A]` or `[A]` in [0, 1]."""
@@ -178,6 +211,16 @@ class Task:
     def regret(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """1 − r, `[B]` or a scalar, in [0, 1]: by how much the optimal step reward exceeds r."""
         return 1.0 - self.step_reward(s, a)
+
+    def potential(self, s: npt.ArrayLike, t: npt.ArrayLike) -> Array:
+        """P_t(s) after `t` steps, `[B]` or a scalar, in [0, c]; 0 without `shaping`."""
+        s = self._states(s)
+        if self.spec.shaping is None:
+            return np.zeros(s.shape[:-1])[()]
+        # Each state a contiguous matrix of one row, so that bits do not depend on the batch.
+        phi = through(self.shaping, np.ascontiguousarray(s)[..., None, :])[..., 0, 0]
+        left = 1.0 - np.asarray(t) / self.spec.horizon
+        return self.spec.shaping.scale * left * phi
 
     def limit(self, s: npt.ArrayLike) -> Array:
         """ℓ, the limits of the action channels, `[B, A]` or `[A]` in [1 − 2τ, 1]; else 1."""
@@ -336,10 +379,13 @@ class Step(NamedTuple):
       similarity: `[B, n]` r̃ over the agent's own channels.
       step_reward: `[B, n]` r.
       regret: `[B, n]` 1 − r.
-      reward: `[B, n]` R, the payout.
+      reward: `[B, n]` R, the payout, and what is paid on top.
       accumulated_reward: `[B, n]` r_cum, after a payout's reset.
       cost: `[B, 1]`, 0 without `safety`.
       safe_regret: `[B, n]` r of the safe action − r.
+      price: `[B, 1]` 1 − r of the safe action, where that is paid; else 0.
+      shaping: `[B, n]` F, 0 without `shaping`.
+      reward_noise: `[B, n]` σ_r ξ, 0 without `noise`.
       terminated: `[B]`.
       truncated: `[B]`.
     """
@@ -355,11 +401,14 @@ class Step(NamedTuple):
     accumulated_reward: Array
     cost: Array
     safe_regret: Array
+    price: Array
+    shaping: Array
+    reward_noise: Array
     terminated: Mask
     truncated: Mask
 
     def write(self, actions: Array, values: Array) -> None:
-        """Write the rows that `actions` `[1 or 3, B, A]` and `values` `[5 or 7, n, B]` have."""
+        """Write the rows that `actions` `[1 or 3, B, A]` and `values` `[5 … 10, n, B]` have."""
         for row, name in zip(actions, ACTIONS, strict=False):
             row[:] = getattr(self, name)
         for row, name in zip(values, NUMBERS, strict=False):
@@ -367,11 +416,17 @@ class Step(NamedTuple):
 
 
 def step(
-    task: Task, s: Array, t: npt.NDArray[np.int64], accumulated_reward: Array, a: Array
+    task: Task,
+    s: Array,
+    t: npt.NDArray[np.int64],
+    accumulated_reward: Array,
+    a: Array,
+    noise: Array | None = None,
 ) -> Step:
     """One step of `B` environments, from states `[B, S]` with finite actions `[B, A]`, clipped.
 
-    `t` `[B]` are the steps completed and `accumulated_reward` `[B, n]` is r_cum before this one.
+    `t` `[B]` are the steps completed and `accumulated_reward` `[B, n]` is r_cum before this one;
+    `noise` `[B, n + S]` ξ of each agent and ζ, None is 0.
     Each environment is a matrix of one row to the oracle: a product of all at once would sum in an
     order that depends on B, and then a batch would not equal its singles bit for bit.
 
@@ -396,24 +451,48 @@ def step(
     safe_reward = task.safe_reward_of(optimal, limit)[:, None]
 
     total = accumulated_reward + step_reward
-    t = t + 1
+    before, t = t, t + 1
     truncated = t >= spec.horizon
     paid = (truncated | (t % spec.k == 0))[:, None]
+    terminated = np.asarray((step_reward < spec.D).any(axis=-1))
+    n = step_reward.shape[1]
+    xi, zeta = (0.0, None) if noise is None else (noise[:, :n], noise[:, n:])
+    state = task.transition(s, a, zeta)
+
+    price = np.where(spec.compensated, 1.0 - safe_reward, 0.0)
+    shaping: Array = np.zeros((len(s), 1))
+    if spec.shaping is not None:
+        later = np.where(terminated, 0.0, spec.shaping.discount * task.potential(state, t))
+        shaping = (later - task.potential(s, before))[:, None]
+    reward_noise = np.broadcast_to(task.sigmas[0] * xi, step_reward.shape)
     return Step(
-        state=task.transition(s, a),
+        state=state,
         optimal_action=optimal,
         limit=limit,
         safe_action=np.minimum(optimal, limit),
         similarity=similarity,
         step_reward=step_reward,
         regret=1.0 - step_reward,
-        reward=np.where(paid, total, 0.0),
+        reward=np.where(paid, total, 0.0) + price + shaping + reward_noise,
         accumulated_reward=np.where(paid, 0.0, total),
         cost=task.cost_of(a, limit)[:, None],
         safe_regret=safe_reward - step_reward,
-        terminated=np.asarray((step_reward < spec.D).any(axis=-1)),
+        price=price,
+        shaping=np.broadcast_to(shaping, step_reward.shape),
+        reward_noise=reward_noise,
+        terminated=terminated,
         truncated=truncated,
     )
+
+
+def shaping_at_switch(before: Task, after: Task | None, s: Array, t: Any) -> float:
+    """What F gains where another task, or None, is in force from the next step on: P of the other.
+
+    Only so the shaping of an episode telescopes over a stream's tasks, and to an outer limit.
+    """
+    g = 1.0 if before.spec.shaping is None else before.spec.shaping.discount
+    later = 0.0 if after is None else after.potential(s, t)
+    return float(g * (later - before.potential(s, t)))
 
 
 def observe(
@@ -440,11 +519,17 @@ def through(layers: Iterable[Layer], x: Array) -> Array:
     return x
 
 
-def _moved(s: Array, a: Array, W: Array, b: Array) -> Array:
-    """ψ(s + a W + b) of states `[..., S]` and actions `[..., A]`; see `Task.transition`."""
+def _rounded(number: float) -> float:
+    return float(np.float32(number))
+
+
+def _moved(s: Array, a: Array, W: Array, b: Array, shift: Array | None = None) -> Array:
+    """ψ(s + a W + b + shift) of states `[..., S]` and actions `[..., A]`; see `Task.transition`."""
     y = s + b
     for i in range(len(W)):
         y = y + W[i] * a[..., i, None].astype(np.float32).astype(np.float64)
+    if shift is not None:
+        y = y + shift
     return np.asarray(2.0 * np.abs(y - np.rint(y)))
 
 

@@ -33,6 +33,9 @@ TASKS = {
     "limited": {"safety": {"tightness": 0.2}, "k": 4},
     "noisy": {"observation": {"distractors": 3}, "D": 0.3},
     "mixed": {"observation": {"mixing": "orthogonal"}},
+    "shaped": {"shaping": {"scale": 30}, "noise": {"reward": 0.3, "transition": 0.1}, "D": 0.3},
+    "compensated": {"safety": {"tightness": 0.2, "compensated": True}, "k": 4},
+    "a noisy team": {"team": TEAM, "k": 4, "noise": {"reward": 0.3, "transition": 0.1}},
     "limited and distracted": {
         "safety": {"tightness": 0.1},
         "observation": {

@@ -90,6 +90,8 @@ class TestReading:
         spec = {
             "safety": {"tightness": 0.2},
             "observation": {"distractors": 3, "mixing": "nonlinear", "mixing_depth": 1},
+            "shaping": {"scale": 3},
+            "noise": {"reward": 0.3, "transition": 0.1},
         }
         dataset = (
             open_dataset(NAME, root)

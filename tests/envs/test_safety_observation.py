@@ -97,11 +97,11 @@ def test_a_step_of_any_spec_is_the_definitions_single_and_in_a_batch(spec, seed,
     env.reset(seed=seed)
     batch.reset(seed=seed)
     for _ in range(3):
-        s, d = env.state, env.distractors
+        s, d, noise = env.state, env.distractors, env.noise
         action = actions_of(batch, rng)
         observation, _, terminated, truncated, info = env.step(action[0])
         together = batch.step(action)
-        np.testing.assert_array_equal(env.state, task.transition(s, action[0]))
+        np.testing.assert_array_equal(env.state, task.transition(s, action[0], noise[1:]))
         np.testing.assert_allclose(info["optimal_action"], task.optimal_action(s), atol=1e-12)
         assert info["similarity"] == pytest.approx(task.similarity(s, action[0]), abs=1e-12)
         np.testing.assert_allclose(

@@ -9,7 +9,7 @@ from sme_registry import SMESpec, materialize
 from sme_registry.envs import arguments
 from sme_registry.errors import ActionError, OptionError, SpecError, StateError
 from sme_registry.jax import CACHE_VARIABLE, env, prepare
-from sme_registry.jax.task import SUPPORTED_FIELDS, check_supported, task_params
+from sme_registry.jax.task import task_params
 from sme_registry.task import observe, step
 
 STEPS = 70
@@ -219,17 +219,3 @@ TEAM = SMESpec.from_dict({"action_dim": 2, "team": {"agents": [{"action_dim": 1}
 def test_what_is_no_task_in_jax_is_refused_by_name(specs, options, message):
     with pytest.raises(SpecError if specs is TEAM else OptionError, match=message):
         task_params(specs, **options)
-
-
-class FutureSpec(SMESpec):
-    """A spec with a field of a later version."""
-
-    gravity: float = 0.0
-
-
-def test_every_field_is_supported_or_refused_on_purpose_and_later_ones_have_their_default():
-    assert SMESpec.model_fields.keys() - SUPPORTED_FIELDS == {"team"}
-    assert SMESpec.model_fields.keys() >= SUPPORTED_FIELDS
-    check_supported(FutureSpec())
-    with pytest.raises(SpecError, match=r"^gravity=0.3: must be absent"):
-        check_supported(FutureSpec(gravity=0.3))

@@ -120,7 +120,7 @@ def test_evaluations_are_episodes_of_numpys_task(dynamics, k):
             similarity += numpy_task.similarity(s, a)
             regret += numpy_task.regret(s, a)
             accumulated = 0.0 if (t + 1) % k == 0 else accumulated + numpy_task.step_reward(s, a)
-            u = functions.random_numbers(jax.random.fold_in(key, t), params)
+            u = functions.random_numbers(jax.random.fold_in(key, t), params).distractors
             d = numpy_task.distractor_step(d, a) if dynamics == "driven" else np.asarray(u)
             s = numpy_task.transition(s, a)
         assert evaluation.similarity[0, episode] == pytest.approx(similarity, abs=1e-3)

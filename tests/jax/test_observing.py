@@ -35,7 +35,7 @@ def rollout(params, keys, actions):
 
     def advance(state, inputs):
         keys, actions = inputs
-        numbers = jax.vmap(functions.random_numbers)(keys, params)
+        numbers = jax.vmap(functions.random_numbers)(keys, params).distractors
         observation, after, *others = jax.vmap(env.step)(keys, state, actions, params)
         return after, (state, numbers, observation, after, *others)
 
@@ -135,7 +135,10 @@ def test_distractors_of_starts_and_noise_are_uniform_and_new():
     @jax.jit
     @partial(jax.vmap, in_axes=(0, None))
     def draw(key, params):
-        own = functions.first_distractors(key, params), functions.random_numbers(key, params)
+        own = (
+            functions.first_distractors(key, params),
+            functions.random_numbers(key, params).distractors,
+        )
         return env.reset(key, params)[1].s, *own
 
     columns = np.concatenate(draw(keys, params), axis=1)
@@ -149,7 +152,7 @@ def test_a_task_without_both_carries_nothing_of_them():
     state = jax.eval_shape(env.reset, jax.random.key(0), params)[1]
     assert len(jax.tree.leaves(state)) == 3
     assert len(jax.tree.leaves(params)) == 10
-    assert functions.random_numbers(jax.random.key(0), params) is None
+    assert functions.random_numbers(jax.random.key(0), params) == (None, None)
 
 
 def test_an_episode_begins_with_any_distractors():
