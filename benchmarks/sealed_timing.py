@@ -22,20 +22,20 @@ import time
 import numpy as np
 from scipy.stats import spearmanr
 
-from leaderboard.seasons.journal import Play, Start
+from leaderboard.seasons.journal import Play
 from sme_registry import SMESpec, materialize
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.seasons.transcript import Chain
 from sme_registry.seasons.wire import StepFormat
 
 SPEC = SMESpec(complexity=5, seed=20)
-START = Start(SPEC, 1, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
+START = (SPEC, 1, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
 def main(steps: int = 100_000) -> None:
     random = np.random.default_rng(2)
     env, task = SMEVectorEnv(SPEC, 1, autoreset_mode="SameStep"), materialize(SPEC)
-    observation = env.reset(seed=START.seed)[0]
+    observation = env.reset(seed=START[1])[0]
     shape = steps, SPEC.action_dim
     # From the optimum to any action, so that the regret takes all values.
     noise = random.random((steps, 1)) * random.uniform(-1.0, 1.0, shape)
@@ -70,7 +70,7 @@ def main(steps: int = 100_000) -> None:
 def timed(actions: np.ndarray) -> np.ndarray:
     """Seconds of each step, as the server takes it, of actions `[n, A]`."""
     form = StepFormat(1, SPEC.state_dim, SPEC.action_dim)
-    play, seconds = Play(START, 1, 10**8), np.empty(len(actions))
+    play, seconds = Play(*START, 1, 10**8), np.empty(len(actions))
     for i, each in enumerate(actions):
         body = form.pack(i + 1, each[None])
         begun = time.perf_counter()

@@ -13,8 +13,7 @@ from leaderboard.documents.board import BoardDocument, Limits
 from leaderboard.documents.result import ClassScore, Result, RunScore, Scores
 from leaderboard.documents.submission import Artefact, Method, Run, Submission, Submitter, Training
 from leaderboard.errors import CODES
-from leaderboard.seasons.entry import Entry, TicketRequest
-from leaderboard.seasons.season import Season, SeasonClass
+from leaderboard.seasons.season import Entry, Season, SeasonClass, TicketRequest
 from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.documents import Behaviour
 from sme_registry.evaluation import EvaluationReport

@@ -226,7 +226,7 @@ def site(
     """
     sections: list[Section] = []
     if WITH_SEASONS:
-        from leaderboard.seasons.pages import SECTION
+        from leaderboard.seasons.web import SECTION
 
         sections.append(SECTION)
 

@@ -17,22 +17,21 @@ from leaderboard.errors import Rejection
 from leaderboard.scoring.ranking import RankedRow
 from leaderboard.seasons.events import SeasonRow
 from leaderboard.seasons.publication import (
+    EASY,
     check_published,
     copy_published,
     create_season,
     read_plan,
     read_season,
-    refuse_large_answers,
-    refuse_unrankable,
+    refuse_unfit,
+    table_regret,
 )
 from leaderboard.seasons.scoring import (
-    EASY,
     by_key,
     counting,
     ranking_facts,
     score_entries,
     season_rankings,
-    table_regret,
 )
 from leaderboard.seasons.season import Master, Reveal, Terms
 from leaderboard.seasons.store import SeasonStore
@@ -40,6 +39,8 @@ from sme_registry.errors import OptionError
 from sme_registry.io import check_new, read_json
 from sme_registry.io.markup import Table, plural
 from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
+
+_UNITS = {"sealed-offline": ("entry", "entries"), "sealed-online": ("ticket", "tickets")}
 
 SeasonId = Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")]
 SecretFile = Annotated[
@@ -94,8 +95,8 @@ def new(
 
     fields = read_plan(read_json(plan), str(plan))
     with SeasonStore.open(board, read_only=True) as store:
-        refuse_large_answers(fields, store.document.limits.artefact_bytes)
-        refuse_unrankable(fields, store.document.runs_to_rank)
+        board_document = store.document
+    refuse_unfit(fields, board_document.limits.artefact_bytes, board_document.runs_to_rank)
     folder = Path(fields.id) if out_folder is None else out_folder
     check_new(folder)
     _warn_of_easy_classes(fields)
@@ -137,7 +138,7 @@ def publish(
     with SeasonStore.open(board) as store:
         store.announce(season)
         if season.published:
-            copy_published(season, folder, store.season_folder(season.digest).published)
+            copy_published(season, folder, store.season_folder(season.digest) / "published")
     out().print(f"{season.id} {season.digest}", soft_wrap=True)
     out().print(f"Open from {season.opens} to {season.closes}.")
 
@@ -200,7 +201,7 @@ def close(board: BoardFolder, season: SeasonId) -> None:
 
 @season.command()
 def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> None:
-    """Publish the master of a season that is over, and score its offline entries.
+    """Publish the master of a season that is over, and score the entries of an offline one.
 
     If it is interrupted, repeat it.
 
@@ -216,8 +217,7 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
         count = len(store.entrants(row.digest))
         with Progress("scoring", count, console=err(), unit="entries") as progress:
             scored = score_entries(store, row.digest, progress.update_of)
-    entries = plural(scored, "entry", "entries")
-    out().print(f"{row.id}: revealed, {entries} scored.")
+    out().print(f"{row.id}: revealed, {plural(scored, *_UNITS[row.track])} scored.")
 
 
 @season.command()
@@ -248,10 +248,11 @@ def show(
             if json:
                 print_json(rows)
                 return
-            columns = ("id", "track", "state", "opens", "closes", "entrants")
-            table = Table("Seasons", dict.fromkeys(columns, "text"))
+            columns = ("id", "track", "state", "opens", "closes", "keys")
+            table = Table("Seasons", {**dict.fromkeys(columns, "text"), "entries": "number"})
             for facts in rows:
-                table.add_row(*(escape(str(facts[name])) for name in columns))
+                count = facts.get("entries", facts.get("tickets"))
+                table.add_row(*(escape(str(facts[name])) for name in columns), str(count))
             out().print(table)
             return
         row, document = store.season_row(season), store.season(season)
@@ -261,12 +262,13 @@ def show(
     if json:
         print_json({**facts, "metric": metric, "ranking": plain})
         return
-    print_pairs(escape(row.title), facts)
+    print_pairs(escape(row.title), {name: fact for name, fact in facts.items() if fact is not None})
+    _, units = _UNITS[row.track]
     of_key: dict[str, Callable[[RankedRow], str]] = {
         "methods": lambda row: str(keys[row.entry.key].methods),
-        "entrants": lambda row: str(keys[row.entry.key].entrants),
+        units: lambda row: str(keys[row.entry.key].entries),
     }
-    note = "methods, entrants: of the same key in this season."
+    note = f"methods, {units}: of the same key in this season."
     for knowledge, ranked in rankings.items():
         if ranked:
             title = f"with knowledge {knowledge}"
@@ -296,20 +298,19 @@ def _warn_of_easy_classes(terms: Terms) -> None:
 
 def _facts(store: SeasonStore, row: SeasonRow) -> dict[str, Any]:
     """A season in short."""
-    time = store.clock.time
-    state = "revealed" if row.reveal else "closed" if time >= row.closes else "open"
-    document = store.season(row.digest)
+    document, entrants = store.season(row.digest), store.entrants(row.digest)
     return {
         "id": row.id,
         "digest": row.digest,
         "track": row.track,
-        "state": "announced" if time < row.opens else state,
+        "state": row.state(store.clock.time),
         "opens": row.opens,
         "closes": row.closes,
         "instances": row.instances,
-        "entrants": len(store.entrants(row.digest)),
+        "keys": len({each.entrant.key for each in entrants}),
+        _UNITS[row.track][1]: len(entrants),
         "admission": document.admission,
-        "admitted": len(store.admitted(row.digest)),
+        "admitted": None if document.admission == "open" else len(store.admitted(row.digest)),
         "commitment": document.commitment,
         "revealed": row.revealed or None,
     }

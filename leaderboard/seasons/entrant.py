@@ -30,11 +30,10 @@ from leaderboard.cli.options import (
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.seasons.admission import enter as enter_folder
-from leaderboard.seasons.entry import Entry, TicketRequest, signer_of
 from leaderboard.seasons.publication import name_of, read_season
-from leaderboard.seasons.season import Season
+from leaderboard.seasons.season import Entry, Season, TicketRequest
 from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.store import enter as enter_folder
 from leaderboard.web.client import Progress as Sent
 from leaderboard.web.client import ServedBoard
 from sme_registry.errors import OptionError, SpecError
@@ -46,15 +45,21 @@ from sme_registry.io import (
     sha256_of,
     write_atomically,
 )
-from sme_registry.io.markup import Table
+from sme_registry.io.markup import Table, plural
 from sme_registry.io.terminal import Progress, err, out
 from sme_registry.seasons import WITHOUT_TASK, Instance, Ticket, actions_in, prepare_policy
+from sme_registry.seasons.transcript import Signer
 from sme_registry.seasons.wire import TicketPlace, pack_table, tickets_path, unpack_table
 
 app = typer.Typer()
 
 _FILE_BYTES = 2**28  # of answers
 
+_POLICY = typer.Argument(
+    metavar="POLICY",
+    help="A policy as `sme evaluate` takes it, or an .npy file of actions in the challenge states. "
+    "{name} stands for the instance, such as deep-0.",
+)
 ActionRange = Annotated[
     str | None,
     typer.Option(metavar="RANGE", help="unit or symmetric; an SB3 model's own by default."),
@@ -115,11 +120,8 @@ def ticket(
         request = TicketRequest.from_dict(
             {
                 **manifest_fields(
-                    signing_key.public,
-                    method=(method, method_version, family, knowledge),
-                    submitter=submitter,
-                    code=code,
-                    statement=statement,
+                    *(signing_key.public, method, method_version, family, knowledge),
+                    *(submitter, code, statement),
                 ),
                 "season": season_digest,
                 "nonce": nonce,
@@ -159,14 +161,7 @@ def ticket(
 def answer(
     url: BoardUrl,
     ticket_file: Annotated[Path, typer.Argument(metavar="TICKET", help="The ticket's file.")],
-    policy: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="POLICY",
-            help="A policy as `sme evaluate` takes it, or an .npy file of actions in the challenge "
-            "states. {name} stands for the instance, such as deep-0.",
-        ),
-    ] = None,
+    policy: Annotated[str | None, _POLICY] = None,
     instance: Annotated[
         list[str] | None,
         typer.Option(
@@ -251,7 +246,7 @@ def answer(
             progress.update(done)
     left = sum(phase != "answered" for phase in phases)
     if left:
-        out().print(f"{left} instances without answers")
+        out().print(f"{plural(left, 'instance')} without answers")
         return
     with Instance(url, held) as first:
         has_ended = first.end_ticket()
@@ -291,14 +286,7 @@ def enter(
         Path,
         typer.Argument(metavar="SEASON", help="The folder with what the organiser published."),
     ],
-    policy: Annotated[
-        str,
-        typer.Argument(
-            metavar="POLICY",
-            help="A policy as `sme evaluate` takes it, or an .npy file of actions in the challenge "
-            "states. {name} stands for the instance, such as deep-0.",
-        ),
-    ],
+    policy: Annotated[str, _POLICY],
     method: MethodName,
     submitter: SubmitterName,
     method_version: MethodVersion = "1",
@@ -345,11 +333,8 @@ def enter(
     entry = Entry.from_dict(
         {
             **manifest_fields(
-                signing_key.public,
-                method=(method, method_version, family, knowledge),
-                submitter=submitter,
-                code=code,
-                statement=statement,
+                *(signing_key.public, method, method_version, family, knowledge),
+                *(submitter, code, statement),
             ),
             "season": season.digest,
             "answers": [name and {"sha256": name, "size": len(data[name])} for name in digests],
@@ -358,7 +343,7 @@ def enter(
     signed = entry.signed(signing_key, receiver_of(board))
     if is_url(board):
         with Progress("uploading", len(data), console=err(), unit="answers") as progress:
-            send_entry(board, season.id, signed, data, signing_key, progress=progress.update_of)
+            send_entry(board, season.id, signed, data, signing_key, progress.update_of)
     else:
         with SeasonStore.open(Path(board)) as store:
             enter_folder(store, signed, answers=data.__getitem__)
@@ -381,10 +366,15 @@ def _answers(policy: str, states: Path, setting: Any, action_range: str | None) 
     return pack_table(actions_in(shown, prepared, setting))
 
 
-def served_season(url: str, id: str, *, insecure: bool = False) -> tuple[str, Receiver]:
+def served_season(url: str, id: str) -> tuple[str, Receiver]:
     """The digest of a season of a served board, and for whom to sign what is sent to it."""
-    with ServedBoard(url, insecure=insecure) as served:
-        answer = served.request("GET", f"/api/seasons/{_name(id)}")
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", id):
+        raise OptionError(
+            f"season={id!r:.80}: must be an id of letters, digits, '_' and '-'. Copy it from the "
+            "board."
+        )
+    with ServedBoard(url, insecure=False) as served:
+        answer = served.request("GET", f"/api/seasons/{id}")
         try:
             found = Season.from_dict(answer["document"], "season.json")
         except (SpecError, LookupError, TypeError) as error:
@@ -392,22 +382,15 @@ def served_season(url: str, id: str, *, insecure: bool = False) -> tuple[str, Re
         return found.digest, served.receiver()
 
 
-def request_ticket(
-    url: str,
-    season: str,
-    signed: Signed[TicketRequest],
-    key: SigningKey,
-    *,
-    insecure: bool = False,
-) -> Ticket:
+def request_ticket(url: str, season: str, signed: Signed[TicketRequest], key: SigningKey) -> Ticket:
     """Start a ticket, or get the one that this request has started before.
 
     `season` is its id, and `key` the entrant's, which signed the request for this board. The
     ticket has the signer of its answers.
     """
     sign = functools.partial(upload_header, key, signed.id, signed.receiver)
-    with ServedBoard(url, insecure=insecure) as served:
-        answer = served.request("POST", tickets_path(_name(season)), signed.to_bytes(), sign)
+    with ServedBoard(url, insecure=False) as served:
+        answer = served.request("POST", tickets_path(season), signed.to_bytes(), sign)
     try:
         ticket = Ticket.from_dict(answer, "ticket")
     except SpecError as error:
@@ -421,26 +404,12 @@ def send_entry(
     signed: Signed[Entry],
     answers: Mapping[str, bytes],
     key: SigningKey,
-    progress: Sent | None = None,
-    *,
-    insecure: bool = False,
-) -> str:
-    """Send an entry of a sealed-offline season to a board, and return its id.
-
-    `answers` are the files that it names, by their digests; the rest is as for `submit`.
-    """
-    with ServedBoard(url, insecure=insecure) as served:
-        path = f"/api/seasons/{_name(season)}/entries"
-        return served.send(path, signed, answers, answers.__getitem__, key, progress)
-
-
-def _name(id: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", id):
-        raise OptionError(
-            f"season={id!r:.80}: must be an id of letters, digits, '_' and '-'. Copy it from the "
-            "board."
-        )
-    return id
+    progress: Sent,
+) -> None:
+    """Send an entry of a sealed-offline season, and first the files that it names, by digest."""
+    with ServedBoard(url, insecure=False) as served:
+        path = f"/api/seasons/{season}/entries"
+        served.send(path, signed, answers, answers.__getitem__, key, progress)
 
 
 def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
@@ -468,23 +437,30 @@ def read_file(path: Path) -> bytes:
 
 def manifest_fields(
     key: str,
-    *,
-    method: tuple[str, str, str | None, str],
+    method: str,
+    version: str,
+    family: str | None,
+    knowledge: str,
     submitter: str,
     code: str | None,
     statement: str,
 ) -> dict[str, Any]:
-    """The fields of a `Manifest`, signed now; the method is name, version, family, knowledge."""
-    name, version, family, knowledge = method
+    """The fields of a `Manifest`, signed now."""
+    kind = {"family": family or method, "knowledge": knowledge}
     return {
-        "method": {
-            "name": name,
-            "version": version,
-            "family": family or name,
-            "knowledge": knowledge,
-        },
+        "method": {"name": method, "version": version, **kind},
         "code": code,
         "submitter": {"name": submitter, "key": key},
         "created": now(),
         "statement": statement,
     }
+
+
+def signer_of(request: Signed[TicketRequest], key: SigningKey) -> Signer | None:
+    """What signs a ticket's transcripts, if the request names `SigningKey.of_answers` of a key."""
+    answers = key.of_answers(request.content.nonce)
+    if request.board is None or request.content.answers_key != answers.public:
+        return None
+    return Signer(
+        board=request.board, address=request.address, request=request.id, key=answers.secret
+    )

@@ -6,20 +6,22 @@ Its rows are a function of the log and of public documents, and hold nothing of 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from leaderboard.documents.result import Scores
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import Rejection
-from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
 from leaderboard.seasons.season import (
     MAX_LANES,
     Admitted,
+    Entry,
     Master,
     Reveal,
+    SealedManifest,
     SealedResult,
     SealedTrack,
     Season,
+    TicketRequest,
     rows_of,
 )
 from leaderboard.store.index import KINDS, Index, Kinds
@@ -37,10 +39,7 @@ def played_bytes(season: Season, result: SealedResult | None = None) -> int:
     """The most bytes that the journals, challenges, answers and snapshots of a ticket take.
 
     A journal is longest where a single lane is stepped: then each step has a record of its own.
-
-    Args:
-      season: the ticket's.
-      result: the ticket's, after which nothing more is written; None before.
+    After the ticket's result nothing more is written.
     """
     total = 0
     rows = rows_of(season.protocol)
@@ -58,55 +57,44 @@ def played_bytes(season: Season, result: SealedResult | None = None) -> int:
     return total
 
 
-@dataclass(frozen=True)
-class SeasonRow:
-    """One season, as pages need it.
+class SeasonRow(NamedTuple):
+    """One season, as pages need it."""
 
-    Attributes:
-      digest: of season.json's content.
-      sequence, announced: of the log entry that announced it.
-      document: SHA-256 of season.json.
-      instances: number of hidden ones, of each ticket or of all entries.
-      reveal: SHA-256 of reveal.json; None until the reveal.
-      revealed: when; empty likewise.
-    """
-
-    digest: str
+    digest: str  # of season.json's content
     sequence: int
-    announced: str
-    document: str
+    announced: str  # time of the log entry
+    document: str  # SHA-256 of season.json
     id: str
     title: str
     track: SealedTrack
     opens: str
     closes: str
-    instances: int
-    reveal: str | None
-    revealed: str
+    instances: int  # number of hidden ones, of each ticket or of all entries
+    reveal: str | None  # SHA-256 of reveal.json; None until the reveal
+    revealed: str  # when; empty likewise
+
+    def state(self, time: str) -> str:
+        """What it is at a time: announced, open, closed or revealed."""
+        if self.reveal is not None:
+            return "revealed"
+        return "announced" if time < self.opens else "open" if time < self.closes else "closed"
 
 
 @dataclass(frozen=True)
 class SealedRow:
     """One entry or ticket.
 
-    Attributes:
-      season: digest of its season.
-      number: 1 for the first of its season, in the log's order.
-      created: when it was signed, as the entrant says.
-      document: SHA-256 of its file.
-      result: SHA-256 of its result's file; None without one.
-      finished: when it got its result; empty likewise.
-      entrant: what rankings need of it. Its `received` is when the ticket started, `runs` the
-        number of hidden instances, and `policies` that of answers. `enough_runs` is false:
-        `scoring` counts them over all tickets of a method.
+    Of its `entrant`, `received` is when the ticket started, `runs` the number of hidden instances,
+    and `policies` that of answers. `enough_runs` is false: `scoring` counts them over all tickets
+    of a method.
     """
 
-    season: str
-    number: int
-    created: str
-    document: str
-    result: str | None
-    finished: str
+    season: str  # digest
+    number: int  # 1 for the first of its season, in the log's order
+    created: str  # when it was signed, as the entrant says
+    document: str  # SHA-256 of its file
+    result: str | None  # SHA-256 of its result's file; None without one
+    finished: str  # when it got its result; empty likewise
     entrant: EntryRow
 
     @property
@@ -120,45 +108,33 @@ class Seasons:
 
     def __init__(self, index: Index) -> None:
         self._index = index
-        self._objects = index.objects
 
     def rows(self) -> list[SeasonRow]:
-        """All seasons, in the order in which they were announced."""
         return [SeasonRow(*row) for row in self._all(f"{_SEASONS} ORDER BY sequence")]
 
     def row(self, name: str) -> SeasonRow | None:
-        """The season of this id or digest; None if there is none."""
         rows = self._all(f"{_SEASONS} WHERE digest = ?1 OR id = ?1", name)
         return SeasonRow(*rows[0]) if rows else None
 
     def entrants(self, season: str) -> list[SealedRow]:
-        """The entries or tickets of a season, by its digest, in the log's order."""
         return [
             _sealed(row) for row in self._all(f"{_SEALED} WHERE track = ? ORDER BY number", season)
         ]
 
     def entrant(self, id: str) -> SealedRow | None:
-        """The entry or ticket of this id; None if there is none."""
         rows = self._all(f"{_SEALED} WHERE id = ? AND track <> ''", id)
         return _sealed(rows[0]) if rows else None
 
     def ticket(self, season: str, number: int) -> SealedRow | None:
-        """The entry or ticket of this number; None if there is none."""
         rows = self._all(f"{_SEALED} WHERE track = ? AND number = ?", season, number)
         return _sealed(rows[0]) if rows else None
 
     def next_number(self, season: str) -> int:
-        """The number of a season's next entry or ticket."""
         [(number,)] = self._all("SELECT count(*) + 1 FROM entry WHERE track = ?", season)
         return int(number)
 
     def read(self, row: SeasonRow) -> Season:
-        """The document of a season.
-
-        Raises:
-          TamperedError: it is missing or altered.
-        """
-        return self._objects.document(Season, row.document)
+        return self._index.objects.document(Season, row.document)
 
     def _season(self, entry: LogEntry) -> None:
         season = self._index.read(Season, entry)
@@ -222,9 +198,8 @@ class Seasons:
     def open(self, name: str, track: SealedTrack, key: str, time: str) -> SeasonRow:
         """The season of this id or digest, which must be of a track, and open to a key at a time.
 
-        Raises:
-          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed`,
-            `season_revealed` or `not_admitted`.
+        A `Rejection` is `season_unknown`, `season_track`, `season_not_open`, `season_closed`,
+        `season_revealed` or `not_admitted`.
         """
         row = self.row(name)
         if row is None:

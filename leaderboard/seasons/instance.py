@@ -23,15 +23,17 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from leaderboard.documents.signed import Signed
+from leaderboard.documents.signed import Signed, verifies
 from leaderboard.errors import Rejection, TamperedError
-from leaderboard.seasons.entry import Answers, InstanceHead, TicketRequest, has_signed
-from leaderboard.seasons.journal import Journal, Play, Start, no_steps
+from leaderboard.seasons.journal import Journal, Play, no_steps
+from leaderboard.seasons.scoring import Answered, HiddenTask
 from leaderboard.seasons.season import (
     MAX_LANES,
-    Float32,
+    Answers,
+    InstanceHead,
     SeasonClass,
     Stepping,
+    TicketRequest,
     read_answers,
     rows_of,
 )
@@ -40,6 +42,7 @@ from sme_registry.errors import ActionError, SMEError, WireError
 from sme_registry.io import read_regular
 from sme_registry.seasons.transcript import EVERY, Chain, answers_head, challenge_head
 from sme_registry.seasons.wire import InstanceStatus, table_bytes
+from sme_registry.spec.document import Document
 
 SignedHead = Signed[InstanceHead]
 Phase = Literal["waiting", "stepping", "answering", "answered"]
@@ -51,8 +54,8 @@ _QUICK_PRODUCTS = 2**23
 class Instance:
     """One hidden instance, for any number of threads.
 
-    `start` and `states` derive what is hidden; `check_running` rejects what comes after the
-    ticket's end. `budget` is in steps over all lanes.
+    `hidden` derives the task; `check_running` rejects what comes after the ticket's end. `budget`
+    is in steps over all lanes.
     """
 
     def __init__(
@@ -62,8 +65,7 @@ class Instance:
         request: Signed[TicketRequest],
         member: SeasonClass,
         protocol: EvaluationProtocol,
-        start: Callable[[], Start],
-        states: Callable[[], bytes],
+        hidden: Callable[[], HiddenTask],
         check_running: Callable[[], None],
     ) -> None:
         self._chain, self._request = chain, request
@@ -71,40 +73,36 @@ class Instance:
         self._member, self._protocol = member, protocol
         assert member.budget is not None  # the track is online
         self.budget = member.budget
-        self._start, self._states, self._check_running = start, states, check_running
-        name = str(chain.instance)
-        self._journal_path, self._answers_path, self._signed_path, self._snapshot_path = (
-            folder / f"{name}{end}" for end in (".journal", ".npy", ".json", ".npz")
+        self._hidden, self._check_running = hidden, check_running
+        name = folder / str(chain.instance)
+        self._journal_path, self._answers_path = (
+            name.with_suffix(".journal"),
+            name.with_suffix(".npy"),
         )
-        self._challenge_path = folder / f"{name}.challenge"
+        self._signed_path, self._snapshot_path = name.with_suffix(".json"), name.with_suffix(".npz")
+        self._challenge_path = name.with_suffix(".challenge")
         self._lock = threading.RLock()
         self._journal: Journal | None = None
         self._play: Play | None = None
         self._answered: bool | None = None  # unknown
 
     @property
-    def phase(self) -> Phase:
-        """How far the entrant is."""
-        with self._lock:
-            journal = self.journal
-            if journal is None:
-                return "waiting"
-            if self.answered:
-                return "answered"
-            spent = journal.steps + journal.lanes > self.budget
-            return "answering" if journal.ended or spent else "stepping"
-
-    @property
     def status(self) -> InstanceStatus:
         """What the entrant may know."""
         with self._lock:
             journal = self.journal
+            if journal is None:
+                return InstanceStatus(phase="waiting", lanes=None, requests=0, used=0)
+            is_over = journal.ended or self._is_spent(journal)
             return InstanceStatus(
-                phase=self.phase,
-                lanes=None if journal is None else journal.lanes,
-                requests=0 if journal is None else journal.requests,
-                used=0 if journal is None else journal.steps,
+                phase="answered" if self.answered else "answering" if is_over else "stepping",
+                lanes=journal.lanes,
+                requests=journal.requests,
+                used=journal.steps,
             )
+
+    def _is_spent(self, journal: Journal) -> bool:
+        return journal.steps + journal.lanes > self.budget
 
     @property
     def is_played(self) -> bool:
@@ -116,7 +114,6 @@ class Instance:
 
     @property
     def journal(self) -> Journal | None:
-        """The steps; None before the start."""
         with self._lock:
             if self._journal is None and self._journal_path.exists():
                 snapshot = self._snapshot()
@@ -130,15 +127,12 @@ class Instance:
         """Whether its answers are stored, with the entrant's signature where that is required."""
         with self._lock:
             if self._answered is None:
-                self._answered = self._answers_path.exists() and (self._is_old or self._has_ended())
+                self._answered = self._answers_path.exists()
+                if self._answered and not self._is_old:
+                    signed, journal = self.signed, self.journal
+                    hashes = None if signed is None else signed.content.hashes
+                    self._answered = journal is not None and hashes == journal.requests + 2
             return self._answered
-
-    def _has_ended(self) -> bool:
-        """Whether the entrant has signed its answers."""
-        signed, journal = self.signed, self.journal
-        if signed is None or journal is None:
-            return False
-        return signed.content.hashes == journal.requests + 2
 
     @property
     def signed(self) -> SignedHead | None:
@@ -159,8 +153,8 @@ class Instance:
         return None
 
     @property
-    def answers(self) -> tuple[Float32, str] | tuple[None, None]:
-        """The answers `[regions · n, A]` and the digest of their file; nothing without any."""
+    def answers(self) -> Answered:
+        """The answers `[regions · n, A]` and the digest of their file."""
         if not self.answered:
             return None, None
         with storage():
@@ -169,7 +163,6 @@ class Instance:
 
     @property
     def answer_bytes(self) -> int:
-        """The most bytes of the answers' file."""
         return table_bytes(rows_of(self._protocol), self._member.setting.action_dim)
 
     @property
@@ -206,11 +199,8 @@ class Instance:
                     journal = Journal.create(self._journal_path, lanes, action_dim)
                 self._journal = journal
             if lanes != journal.lanes:
-                raise Rejection(
-                    "start_conflict",
-                    f"lanes={lanes}: the instance was started with {journal.lanes}. Go on with "
-                    "these.",
-                )
+                message = f"lanes={lanes}: the instance was started with {journal.lanes}."
+                raise Rejection("start_conflict", f"{message} Go on with these.")
             return self._playing().started
 
     def step(self, body: bytes, signature: str = "") -> bytes:
@@ -241,7 +231,6 @@ class Instance:
             return answer
 
     def finish(self, signature: str) -> None:
-        """Take no more steps."""
         with self._lock:
             self._check_running()
             journal, play = self._started(), self._playing()
@@ -251,14 +240,12 @@ class Instance:
             self.release()
 
     def challenge(self) -> bytes:
-        """The challenge states, an .npy file."""
         with self._lock:
             if not self._started().ended:
-                raise _wrong_phase(self.phase, "Finish it before the challenge.")
+                raise _wrong_phase(self.status.phase, "Finish it before the challenge.")
             with storage():
                 if not self._challenge_path.exists():
-                    with io.atomic_file(self._challenge_path) as stream:
-                        stream.write(self._states())
+                    write_whole(self._challenge_path, self._hidden().challenge)
                 return read_regular(self._challenge_path, 2**28)
 
     def answer(self, data: bytes, signature: str) -> bool:
@@ -282,26 +269,27 @@ class Instance:
             play = self._playing()
             head = answers_head(challenge_head(play.head, states), data)
             signed = self._signed(play.requests + 2, head, signature)
-            with io.atomic_file(self._answers_path) as stream:
-                stream.write(data)
+            write_whole(self._answers_path, data)
             try:
-                self._write(signed)
+                write_whole(self._signed_path, signed.to_bytes())
                 io.sync_folder(self._answers_path.parent)
             finally:  # the file may be there even if the folder could not be synced
                 self._answered = None
             self.release()
             return True
 
+    @property
     def final_head(self) -> str | None:
-        """The head of the transcript once it is answered; None before."""
         signed = self.signed
         return signed.content.head if signed is not None and self.answered else None
 
     def stepping(self) -> Stepping:
         """The regret of the steps that the entrant has signed, as it was summed when they came."""
         with self._lock:
-            signed = self.signed
-            if signed is None or self.journal is None:
+            journal, signed = self.journal, self.signed
+            if journal is None or not (self._is_old or self._signed_path.exists()):
+                return no_steps(self.budget, journal.lanes if journal else 1)
+            if signed is None:
                 return self.replayed()
             play = self._playing()
             self.release()
@@ -315,7 +303,7 @@ class Instance:
         if not self._journal_path.exists():
             return no_steps(self.budget)
         journal = Journal.open(self._journal_path)
-        play = Play(self._start(), journal.lanes, self.budget)
+        play = self._new_play(journal.lanes)
         last = journal.requests
         if not self._is_old:
             last = 0 if signed is None else min(last, signed.content.hashes)
@@ -335,7 +323,7 @@ class Instance:
         else:
             head, number = play.head, signed.content.hashes
             if number > journal.requests:
-                head = answers_head(challenge_head(head, self._states()), answers)
+                head = answers_head(challenge_head(head, self._hidden().challenge), answers)
             is_right = signed.id == self._chain.at(number, head).digest and has_signed(
                 self._request, signed.signature, signed.content
             )
@@ -366,7 +354,6 @@ class Instance:
             journal.sync()
 
     def forget(self) -> None:
-        """Remove the snapshot."""
         with contextlib.suppress(OSError):
             self._snapshot_path.unlink(missing_ok=True)
 
@@ -376,14 +363,17 @@ class Instance:
             with contextlib.suppress(OSError):  # the steps survive all but a loss of power
                 self.sync()
                 if self._play is not None:
-                    self._save(self._play)
+                    write_whole(self._snapshot_path, self._play.snapshot())
             self._play = None
 
+    def _new_play(self, lanes: int) -> Play:
+        hidden = self._hidden()
+        return Play(hidden.spec, hidden.starts, self._chain, lanes, self.budget)
+
     def _playing(self) -> Play:
-        """What is in memory; from the snapshot and the steps after it where it was not."""
         if self._play is None:
             journal, snapshot = self._started(), self._snapshot()
-            play = Play(self._start(), journal.lanes, self.budget)
+            play = self._new_play(journal.lanes)
             if snapshot is not None and snapshot["counts"][0] <= journal.requests:
                 play.restore(snapshot)
             for body in journal.bodies(play.requests):
@@ -400,10 +390,6 @@ class Instance:
         except (OSError, EOFError, ValueError, zipfile.BadZipFile):
             return None
 
-    def _save(self, play: Play) -> None:
-        with io.atomic_file(self._snapshot_path) as stream:
-            stream.write(play.snapshot())
-
     def _sign(self, play: Play, signature: str) -> None:
         """Store the entrant's signature of all steps so far, once."""
         if play.signed == play.requests:
@@ -411,9 +397,9 @@ class Instance:
         signed = self._signed(play.requests, play.head, signature)
         with storage():
             self.sync()
-            self._write(signed)
+            write_whole(self._signed_path, signed.to_bytes())
             play.sign()
-            self._save(play)
+            write_whole(self._snapshot_path, play.snapshot())
 
     def _signed(self, number: int, head: bytes, signature: str) -> SignedHead:
         document = self._chain.at(number, head)
@@ -429,10 +415,6 @@ class Instance:
             signature=signature,
             **self._request.receiver._asdict(),
         )
-
-    def _write(self, signed: SignedHead) -> None:
-        with io.atomic_file(self._signed_path) as stream:
-            stream.write(io.to_json(signed.to_dict()).encode())
 
     def _started(self) -> Journal:
         """The journal, or a rejection before the start."""
@@ -456,13 +438,21 @@ class Instance:
                 f"number={number}: must be {following}, the next one. Send that first.",
             )
         if journal.ended:
-            raise _wrong_phase(self.phase, "No more steps can be taken.")
-        if journal.steps + journal.lanes > self.budget:
+            raise _wrong_phase(self.status.phase, "No more steps can be taken.")
+        if self._is_spent(journal):
             raise Rejection(
                 "budget_spent",
                 f"steps: {journal.steps} of {self.budget} are taken, and {journal.lanes} more do "
                 "not fit. Answer the challenge.",
             )
+
+
+def has_signed(request: Signed[TicketRequest], signature: str, document: Document) -> bool:
+    """Whether the key that a request names has signed a document of its ticket."""
+    key = request.content.answers_key
+    return key is not None and verifies(
+        key, signature, "answers", document.digest, request.receiver
+    )
 
 
 def _is_due(play: Play) -> bool:
@@ -472,6 +462,11 @@ def _is_due(play: Play) -> bool:
 
 def _wrong_phase(phase: Phase, advice: str) -> Rejection:
     return Rejection("instance_phase", f"instance: is {phase}. {advice}")
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    with io.atomic_file(path) as stream:
+        stream.write(data)
 
 
 @contextlib.contextmanager

@@ -31,7 +31,6 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -69,7 +68,6 @@ class Journal:
 
     @classmethod
     def create(cls, path: Path, lanes: int, action_dim: int) -> Journal:
-        """A new, empty journal."""
         header = _HEADER.pack(_MAGIC, lanes, action_dim)
         if not path.parent.is_dir():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -112,7 +110,6 @@ class Journal:
         self.requests += 1
 
     def end(self) -> None:
-        """End the stepping, durably; ending it twice does nothing."""
         if not self.ended:
             self._append(_END, bytes(self._actions_size))
             self.ended = True
@@ -164,7 +161,6 @@ class Journal:
             os.close(handle)
 
     def _cut(self, handle: int) -> None:
-        """Remove what a failed write has left."""
         if self._torn:
             os.ftruncate(handle, self._size)
             self._torn = False
@@ -210,40 +206,30 @@ MOST_PARTS = 100
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
-@dataclass(frozen=True)
-class Start:
-    """What the steps of an instance follow from, besides the actions; `repr` does not show it."""
-
-    spec: SMESpec = field(repr=False)  # the hidden task
-    seed: int = field(repr=False)  # of the first lane's episodes; lane i has seed + i
-    chain: Chain
-
-
 class Play:
     """An instance that has begun, with a budget of steps over all its lanes.
 
     `head` is that of the transcript after all `requests`, `last` the last request and its answer,
-    and `signed` how many requests the entrant has signed: −1 before the first signature.
+    and `signed` how many requests the entrant has signed: −1 before the first signature. The
+    episodes of the first lane have the seed, those of lane i seed + i.
     """
 
-    def __init__(self, start: Start, lanes: int, budget: int) -> None:
-        self._start, self._env = start, SMEVectorEnv(start.spec, lanes, autoreset_mode="SameStep")
-        self._format = StepFormat(lanes, start.spec.state_dim, start.spec.action_dim)
-        self._observation = self._env.reset(seed=start.seed)[0]
+    def __init__(self, spec: SMESpec, seed: int, chain: Chain, lanes: int, budget: int) -> None:
+        self._seed, self._env = seed, SMEVectorEnv(spec, lanes, autoreset_mode="SameStep")
+        self._format = StepFormat(lanes, spec.state_dim, spec.action_dim)
+        self._observation = self._env.reset(seed=seed)[0]
         self._possible = budget // lanes
         # Regret, that of the constant ½, and requests, of each part of the budget.
         self._sums = np.zeros((min(MOST_PARTS, self._possible), 3))
         self._signed_sums = self._sums.copy()
         self.requests, self.signed, self.last = 0, -1, (b"", b"")
-        self.head = start.chain.first_head(lanes, self.started)
+        self.head = chain.first_head(lanes, self.started)
 
     @property
     def started(self) -> bytes:
-        """The answer to a request to begin, or to go on."""
         return self._format.pack(self.requests, self._observation)
 
     def unpack(self, body: bytes) -> int:
-        """The number of a request for steps; raises what `StepFormat.unpack_request` raises."""
         return self._format.unpack_request(body)[0]
 
     def take(self, body: bytes) -> bytes:
@@ -268,7 +254,6 @@ class Play:
         return answer
 
     def sign(self) -> None:
-        """Note that the entrant has signed all of this."""
         self.signed, self._signed_sums = self.requests, self._sums.copy()
 
     @property
@@ -283,7 +268,6 @@ class Play:
         )
 
     def snapshot(self) -> bytes:
-        """All of it but the start: arrays in an .npz file."""
         stream = streams.BytesIO()
         texts = {"head": self.head, "body": self.last[0], "answer": self.last[1]}
         arrays: dict[str, Any] = {
@@ -299,7 +283,7 @@ class Play:
 
     def restore(self, snapshot: Arrays) -> None:
         """Go on from the arrays of a snapshot of the same start."""
-        self._env.restore(snapshot, self._start.seed)
+        self._env.restore(snapshot, self._seed)
         self.requests, self.signed = snapshot["counts"].tolist()
         self._observation = snapshot["observation"]
         self._sums, self._signed_sums = snapshot["sums"], snapshot["signed_sums"]

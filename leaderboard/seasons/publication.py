@@ -16,8 +16,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from leaderboard.errors import BoardError
-from leaderboard.seasons.scoring import HiddenTask, challenge, instances
+from leaderboard.seasons.scoring import HiddenTask, instances
 from leaderboard.seasons.season import (
     MAX_INSTANCES,
     Digests,
@@ -30,10 +32,12 @@ from leaderboard.seasons.season import (
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
 from leaderboard.web.client import Files
+from sme_registry import SMESpec, materialize
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import build_folder, read_json, read_regular, sha256_of, to_json, versions
-from sme_registry.seasons.wire import instance_name, pack_table, table_bytes
+from sme_registry.seasons.wire import instance_name, table_bytes
+from sme_registry.spec import Setting
 from sme_registry.task.engine import chosen_backend
 
 Progress = Callable[[int, int], None]
@@ -43,25 +47,21 @@ _UNKNOWN = "sha256:" + "0" * 64
 
 
 def name_of(hidden: Hidden) -> str:
-    """The name of an instance in files: its class and its number in it."""
     return instance_name(hidden.member.name, hidden.instance)
 
 
 def challenge_path(folder: Path, hidden: Hidden) -> Path:
-    """The file with the challenge states of an instance."""
     return folder / "challenges" / f"{name_of(hidden)}.npy"
 
 
 def dataset_path(folder: Path, season: str, hidden: Hidden) -> Path:
-    """The folder of the data set of an instance."""
     return folder / "datasets" / _dataset_id(season, hidden)
 
 
-def refuse_large_answers(terms: Terms, limit: int) -> None:
-    """Refuse a season whose answers are larger than a board's artefacts may be.
+def refuse_unfit(terms: Terms, limit: int, runs_to_rank: int) -> None:
+    """Refuse a season with answers of more bytes than a board takes, or in which nobody has a rank.
 
-    Raises:
-      BoardError: names the class.
+    A rank on the board needs so many runs in each class.
     """
     for member in terms.classes:
         size = table_bytes(rows_of(terms.protocol), member.setting.action_dim)
@@ -70,15 +70,6 @@ def refuse_large_answers(terms: Terms, limit: int) -> None:
                 f"classes.{member.name}: its answers have {size:,} bytes: must be at most "
                 f"{limit:,}, the board's limit on artefacts. Use fewer states per region."
             )
-
-
-def refuse_unrankable(terms: Terms, runs_to_rank: int) -> None:
-    """Refuse a season in which nobody can have the runs that a board's ranks need.
-
-    Raises:
-      BoardError: names the class.
-    """
-    for member in terms.classes:
         most = member.instances * (terms.tickets_per_key or 1)
         if most < runs_to_rank:
             raise BoardError(
@@ -90,18 +81,10 @@ def refuse_unrankable(terms: Terms, runs_to_rank: int) -> None:
 
 
 def read_plan(plan: Any, source: str = "plan") -> Terms:
-    """The terms of a season whose data sets and challenge states are not generated yet.
+    """The terms of a season that is not generated yet, with digests of zeros.
 
-    Args:
-      plan: the fields of `Terms`, without `published`. `protocol` may be left out for the one in
-        the catalogue that `protocol_name` names.
-      source: what errors call it.
-
-    Returns:
-      The terms, with digests of zeros.
-
-    Raises:
-      SpecError, UnknownNameError: a field is invalid.
+    `plan` has the fields of `Terms`, without `published`. `protocol` may be left out for the one in
+    the catalogue that `protocol_name` names. Errors call the plan `source`.
     """
     fields = dict(plan) if isinstance(plan, dict) else {}
     name = fields.get("protocol_name")
@@ -131,21 +114,10 @@ def create_season(
     folder: str | os.PathLike[str],
     progress: Progress | None = None,
 ) -> Season:
-    """Generate all that is published of a season, into a new folder.
+    """Generate all that is published of a season, into a new folder, completely or not at all.
 
-    Args:
-      plan: as `read_plan` returns it.
-      master: the season's secret.
-      folder: it gets `season.json` and, offline, data sets and challenge states; completely or not
-        at all.
-      progress: called with the number of instances done, and of all.
-
-    Returns:
-      The season, committed to the master.
-
-    Raises:
-      BoardError, NameTakenError, OptionError: the folder exists or cannot be written.
-      ResourceLimitError, MissingDependencyError: a data set cannot be generated or written.
+    It gets `season.json` and, offline, data sets and challenge states. `progress` is called with
+    the number of instances done, and of all.
     """
     with build_folder(Path(folder)) as building:
         published = []
@@ -155,27 +127,19 @@ def create_season(
                 published.append(_publish(instance, plan.id, master, Path(building)))
                 if progress is not None:
                     progress(done, len(every))
+        numba = ["numba"] if chosen_backend() == "numba" else []
         fields = {
             **plan.to_dict(),
             "published": [each.to_dict() for each in published],
-            "versions": _versions(),
+            "versions": versions(["numpy", "scipy", *numba]),
         }
         season = Terms.from_dict(fields).commit(master)
         (Path(building) / SEASON).write_text(to_json(season.to_dict()))
     return season
 
 
-def _versions() -> dict[str, str]:
-    numba = ["numba"] if chosen_backend() == "numba" else []
-    return versions(["numpy", "scipy", *numba])
-
-
 def read_season(folder: str | os.PathLike[str]) -> Season:
-    """The season in a folder that `create_season` wrote, or in a downloaded copy.
-
-    Raises:
-      SpecError: there is none.
-    """
+    """The season in a folder that `create_season` wrote, or in a downloaded copy."""
     path = Path(folder) / SEASON
     return Season.from_dict(read_json(path), str(path))
 
@@ -198,7 +162,7 @@ def copy_published(season: Season, source: Path, target: Path) -> None:
 
 
 def _check_copy(season: Season, folder: Path) -> None:
-    if season.published and folder.is_dir():
+    if folder.is_dir():  # a copy may be without data
         check_published(season, folder)
 
 
@@ -206,9 +170,9 @@ def files_of_seasons(store: Store) -> Iterator[Files]:
     """The public files of a board's seasons, for `fetch`."""
     assert isinstance(store, SeasonStore)
     for row in store.seasons():
-        season, folder = store.season(row.digest), store.season_folder(row.digest)
-        check = partial(_check_copy, season, folder.published)
-        yield Files(f"/api/seasons/{row.id}/files", folder.path, check)
+        folder = store.season_folder(row.digest)
+        check = partial(_check_copy, store.season(row.digest), folder / "published")
+        yield Files(f"/api/seasons/{row.id}/files", folder, check)
 
 
 def check_published(
@@ -216,11 +180,7 @@ def check_published(
 ) -> int:
     """Check that data sets and challenge states are those that a season was committed to.
 
-    Returns:
-      Their number.
-
-    Raises:
-      BoardError: a file is missing, or differs from its digest.
+    Returns their number.
     """
     folder = Path(folder)
     for done, (hidden, digests) in enumerate(
@@ -229,9 +189,23 @@ def check_published(
         path = dataset_path(folder, season.id, hidden)
         data = SealedDataset.read(path)
         _refuse_other_digest(path, data.digest, digests.data)
-        _refuse_other_sizes(path, data, hidden)
+        setting, promised = hidden.member.setting, hidden.member.data
+        assert promised is not None  # the track is offline
+        found = (*data.observations.shape, data.actions.shape[1])
+        shape = (promised.transitions, setting.state_dim + 2, setting.action_dim)
+        if found != shape:
+            raise BoardError(
+                f"{path}: has {found} rows, observation entries and action channels: must have "
+                f"{shape}, as {SEASON} says. The organiser must create the season again."
+            )
         path = challenge_path(folder, hidden)
-        _refuse_other_digest(path, _file_digest(path, season, hidden), digests.challenge)
+        size = table_bytes(rows_of(season.protocol), setting.state_dim + 2)
+        try:
+            states = read_regular(path, size)
+        except OSError as error:
+            reason = f"cannot be read: {error.strerror}. Download it again."
+            raise BoardError(f"{path}: {reason}") from None
+        _refuse_other_digest(path, sha256_of(states), digests.challenge)
         if progress is not None:
             progress(done, len(season.published))
     return len(season.published)
@@ -245,36 +219,13 @@ def _refuse_other_digest(path: Path, found: str, expected: str) -> None:
         )
 
 
-def _refuse_other_sizes(path: Path, data: SealedDataset, hidden: Hidden) -> None:
-    """Refuse a data set that is committed to, but is not what the season's terms promise."""
-    assert hidden.member.data is not None  # the track is offline
-    setting = hidden.member.setting
-    found = (*data.observations.shape, data.actions.shape[1])
-    promised = (hidden.member.data.transitions, setting.state_dim + 2, setting.action_dim)
-    if found != promised:
-        raise BoardError(
-            f"{path}: has {found} rows, observation entries and action channels: must have "
-            f"{promised}, as the terms in {SEASON} say. The organiser must create the season again."
-        )
-
-
 def follows(
     instance: HiddenTask, master: Master, expected: Digests, folder: Path | None = None
 ) -> Literal["exactly", "within rounding", "unknown", "no"]:
     """Whether what was published of an instance is what the master gives when generated again.
 
-    Args:
-      instance: the instance.
-      master: the season's secret.
-      expected: the digests in the season's document.
-      folder: a copy of all that was published, to compare data sets where digests differ: other
-        processors and other versions of NumPy may round a value otherwise.
-
-    Returns:
-      "unknown" if the data set's digest differs and there is no copy.
-
-    Raises:
-      BoardError: the copy's data set has another digest.
+    Where digests differ, as other processors and versions of NumPy may round otherwise, data sets
+    are compared, if `folder` is a copy of all that was published: otherwise it is unknown.
     """
     data, states = _generate(instance, master)
     if sha256_of(states) != expected.challenge:
@@ -290,8 +241,7 @@ def follows(
 
 
 def _generate(instance: HiddenTask, master: Master) -> tuple[SealedDataset, bytes]:
-    data = SealedDataset.collect(recipe(instance, master))
-    return data, pack_table(challenge(instance.spec, instance.protocol))
+    return SealedDataset.collect(recipe(instance, master)), instance.challenge
 
 
 def recipe(instance: HiddenTask, master: Master) -> DatasetRecipe:
@@ -309,16 +259,13 @@ def recipe(instance: HiddenTask, master: Master) -> DatasetRecipe:
 
 
 def _publish(instance: HiddenTask, season: str, master: Master, folder: Path) -> Digests:
+    hidden = instance.hidden
     data, states = _generate(instance, master)
     data = data.rounded()
-    data.write(_dataset_id(season, instance.hidden), folder / "datasets")
-    path = challenge_path(folder, instance.hidden)
+    data.write(_dataset_id(season, hidden), folder / "datasets")
+    path = challenge_path(folder, hidden)
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(states)
-    return _digests(instance.hidden, data, states)
-
-
-def _digests(hidden: Hidden, data: SealedDataset, states: bytes) -> Digests:
     return Digests(
         class_name=hidden.member.name,
         instance=hidden.instance,
@@ -331,9 +278,37 @@ def _dataset_id(season: str, hidden: Hidden) -> str:
     return f"sealed/{season}/{name_of(hidden)}-v0"
 
 
-def _file_digest(path: Path, season: Season, hidden: Hidden) -> str:
-    size = table_bytes(rows_of(season.protocol), hidden.member.setting.state_dim + 2)
-    try:
-        return sha256_of(read_regular(path, size))
-    except OSError as error:
-        raise BoardError(f"{path}: cannot be read: {error.strerror}. Download it again.") from None
+# With few state channels a table of states, of which the nearest answer, fills the cube.
+EASY = 0.1
+"""Below it a table leaves little to learn."""
+
+MOST_ROWS = 10_000
+_NEIGHBOURS = (1, 8)
+_SEEDS = (0, 1)  # public: nothing is measured on hidden tasks
+_QUESTIONS = 300
+
+
+def table_regret(setting: Setting, rows: int) -> float:
+    """The normalised regret N₀ within the cube of a table of random states and their optima.
+
+    `rows` is the size of the data set, or the steps of the budget; at most `MOST_ROWS` are taken.
+    It is the mean over public tasks of this setting, of the better of the nearest state's optimum
+    and the mean of the eight nearest ones. Labels are exact, so data with noise do worse.
+    """
+    return float(np.mean([_regret(setting, rows, seed) for seed in _SEEDS]))
+
+
+def _regret(setting: Setting, rows: int, seed: int) -> float:
+    from scipy.spatial import cKDTree
+
+    task = materialize(SMESpec.from_dict({**setting.to_dict(), "seed": seed}))
+    random = np.random.default_rng(seed)
+    states = random.random((min(rows, MOST_ROWS), setting.state_dim))
+    asked = random.random((_QUESTIONS, setting.state_dim))
+    labels, optimum = task.optimal_action(states), task.optimal_action(asked)
+    tree = cKDTree(states)
+    errors = []
+    for count in _NEIGHBOURS:
+        _, nearest = tree.query(asked, range(1, min(count, len(states)) + 1))
+        errors.append(np.abs(labels[nearest].mean(axis=1) - optimum).mean())
+    return float(min(errors) / np.abs(0.5 - optimum).mean())

@@ -21,8 +21,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from leaderboard.documents.board import RULES
 from leaderboard.documents.result import Metric, RunScore, Scores
 from leaderboard.documents.submission import Artefact, Knowledge
@@ -46,12 +44,11 @@ from leaderboard.seasons.season import (
     Stepping,
     Terms,
     read_answers,
-    rows_of,
 )
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import EntryRow
 from leaderboard.web.tables import row_facts
-from sme_registry import EvaluationProtocol, SMESpec, materialize
+from sme_registry import EvaluationProtocol, SMESpec
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import (
     EvaluationReport,
@@ -59,7 +56,7 @@ from sme_registry.evaluation import (
     evaluate_many,
     evaluation_observations,
 )
-from sme_registry.spec import Setting
+from sme_registry.seasons.wire import pack_table
 
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch", "onnxruntime")
@@ -67,80 +64,54 @@ _UNUSED = ("stable_baselines3", "torch", "onnxruntime")
 
 @dataclass(frozen=True)
 class HiddenTask:
-    """One hidden instance, as far as the master determines it.
-
-    Attributes:
-      hidden: its class and number.
-      place: of its secrets.
-      spec: the task; `repr` shows neither it nor the protocol, whose seed is secret, too.
-      protocol: of its challenge states.
-    """
+    """One hidden instance, as far as the master determines it; `repr` shows nothing of that."""
 
     hidden: Hidden
-    place: Place
+    place: Place  # of its secrets
     spec: SMESpec
-    protocol: EvaluationProtocol
+    protocol: EvaluationProtocol  # of its challenge states
+    starts: int  # seed of the first lane's episodes, which the server steps; lane i has starts + i
+
+    @classmethod
+    def of(
+        cls, terms: Terms, master: Master, hidden: Hidden, ticket: str = "", nonce: str = ""
+    ) -> HiddenTask:
+        """An instance of a season, or of one of its tickets, by its number and its nonce."""
+        member = hidden.member
+        place = Place(terms.id, member.name, hidden.instance, ticket, nonce)
+        spec = SMESpec.from_dict({**member.setting.to_dict(), "seed": master.seed(place)})
+        protocol = terms.protocol.model_copy(update={"seed": master.states_seed(place)})
+        starts = int.from_bytes(master.secret("starts", place))
+        return cls(hidden, place, spec, protocol, starts)
 
     def __repr__(self) -> str:
         return f"HiddenTask({self.hidden.member.name}, {self.hidden.instance})"
 
     @property
-    def rows(self) -> int:
-        """The number of challenge states: of each region as many, region after region."""
-        return rows_of(self.protocol)
+    def challenge(self) -> bytes:
+        """The .npy file of `[regions · n, S + 2]` challenge states, those of WD in [0, 1]."""
+        return pack_table(evaluation_observations(self.spec, self.protocol))
 
 
 def instances(
     terms: Terms, master: Master, ticket: str = "", nonce: str = ""
 ) -> Iterator[HiddenTask]:
-    """Every hidden instance of a season, or of one of its tickets, in order.
-
-    Args:
-      terms: the season.
-      master: its secret.
-      ticket, nonce: the ticket's number, and the nonce in its request; empty offline.
-    """
-    for hidden in terms.hidden:
-        member = hidden.member
-        place = Place(terms.id, member.name, hidden.instance, ticket, nonce)
-        spec = SMESpec.from_dict({**member.setting.to_dict(), "seed": master.seed(place)})
-        seed = master.states_seed(place)
-        yield HiddenTask(hidden, place, spec, terms.protocol.model_copy(update={"seed": seed}))
+    """Every hidden instance of a season, or of one of its tickets, in order."""
+    return (HiddenTask.of(terms, master, hidden, ticket, nonce) for hidden in terms.hidden)
 
 
-def challenge(spec: SMESpec, protocol: EvaluationProtocol) -> Float32:
-    """The challenge states of an instance.
-
-    Args:
-      spec: the task.
-      protocol: the regions, and the seed of the states.
-
-    Returns:
-      `[regions · n, S + 2]` observations, region after region; those of WD in [0, 1].
-    """
-    return evaluation_observations(spec, protocol)
-
-
-def score_run(
-    instance: HiddenTask, answers: Float32 | None, digest: str | None, rules: int = RULES
-) -> tuple[RunScore, dict[str, str]]:
-    """The score of the answers on an instance, and the versions of packages behind it.
-
-    Args:
-      instance: the hidden instance.
-      answers: `[regions · n, A]` actions in its challenge states; None where there are none, which
-        scores 1 in every metric.
-      digest: of the answers' file; None likewise.
-      rules: of the board.
-    """
-    [scored] = score_runs(instance, [(answers, digest)], rules)
-    return scored
+Answered = tuple[Float32 | None, str | None]
+"""`[regions · n, A]` actions in challenge states and the digest of their file; both may be None."""
 
 
 def score_runs(
-    instance: HiddenTask, answered: Sequence[tuple[Float32 | None, str | None]], rules: int
+    instance: HiddenTask, answered: Sequence[Answered], rules: int = RULES
 ) -> list[tuple[RunScore, dict[str, str]]]:
-    """`score_run` of several answers on an instance, whose optimum takes most of the time."""
+    """The scores of several answers on an instance, and the versions of packages behind them.
+
+    Its optimum takes most of the time. No answers score 1 in every metric.
+    """
+    name = instance.hidden.member.name
     replies = [None if answers is None else _Replies(answers) for answers, _ in answered]
     policies = [
         (as_policy(each, instance.spec, action_range="unit", name="answers"), instance.spec)
@@ -151,14 +122,12 @@ def score_runs(
     scores: list[tuple[RunScore, dict[str, str]]] = []
     for each, (_, digest) in zip(replies, answered, strict=True):
         if each is None:
-            name = instance.hidden.member.name
             scores.append((failed_run(instance.protocol, name, None), {}))
             continue
         report = next(reports)
         if isinstance(report, PolicyError):
             raise report
         each.refuse_unused()
-        name = instance.hidden.member.name
         run = scored_run(report, name, digest, rules, spec=None, evaluation_seed=None)
         scores.append((run, _versions(report)))
     return scores
@@ -194,18 +163,11 @@ def sealed_result(
     stepping: Sequence[Stepping] = (),
     rules: int = RULES,
 ) -> SealedResult:
-    """The result of scored runs: θ, intervals and flags.
+    """The result of scored runs, one on each hidden instance: θ, intervals and flags.
 
-    Args:
-      season: its classes.
-      subject: id of the entry, or of the request for the ticket.
-      runs: one on each hidden instance, in the season's order.
-      versions: of packages.
-      draws: number of bootstrap resamples, the board's.
-      stepping: online, of each run.
-      rules: of the board.
+    `draws` and `rules` are the board's.
     """
-    groups = groups_of_season(season, [runs])
+    groups = _groups(season, [runs])
     scores = method_scores(groups, draws, season.digest)
     return SealedResult(
         season=season.digest,
@@ -219,12 +181,10 @@ def sealed_result(
     )
 
 
-def groups_of_season(season: Season, entrants: Sequence[Sequence[RunScore]]) -> Groups:
-    """The runs of a method by class, each in a group of its own: no two are on the same instance.
+def _groups(season: Season, entrants: Sequence[Sequence[RunScore]]) -> Groups:
+    """The runs of a method's entry or tickets, by class.
 
-    Args:
-      season: its classes.
-      entrants: the runs of each entry or ticket, one on each hidden instance, in order.
+    Each is in a group of its own: no two are on the same instance.
     """
     groups: Groups = {member.name: {} for member in season.classes}
     for number, runs in enumerate(entrants):
@@ -260,42 +220,32 @@ class OfKey(NamedTuple):
     """How often a key takes part in a season: who tries often is lucky once."""
 
     methods: int
-    entrants: int
+    entries: int  # or tickets
 
 
 def by_key(store: SeasonStore, season: Season) -> dict[str, OfKey]:
-    """The numbers of methods, and of entries or tickets, of each key in a season."""
     rows = store.entrants(season.digest)
     methods = Counter(key for key, _ in {row.method for row in rows})
-    entrants = Counter(row.entrant.key for row in rows)
-    return {key: OfKey(methods[key], count) for key, count in entrants.items()}
+    entries = Counter(row.entrant.key for row in rows)
+    return {key: OfKey(methods[key], count) for key, count in entries.items()}
 
 
 def score_entries(store: SeasonStore, name: str, progress: Progress | None = None) -> int:
     """Score the counting entries of a revealed offline season that have no result yet.
 
-    Args:
-      store: the board.
-      name: id or digest of the season.
-      progress: called with the number of entries done, and of all.
-
-    Returns:
-      The number of entries that were scored.
-
-    Raises:
-      Rejection: `season_unknown` or `season_not_closed`.
-      BoardError: an answer is missing, or a result cannot be written.
+    Returns how many have one now; the tickets of an online season had theirs when they ended.
     """
     season, master = store.season(name), store.revealed_master(name)
-    waiting = [row for row in counting(store, season) if row.result is None]
+    rows = counting(store, season)
     if season.track == "sealed-online":
-        return 0
+        return len(rows)
+    waiting = [row for row in rows if row.result is None]
     results = scored_entries(store, season, master, waiting)
     for done, result in enumerate(results, start=1):
-        store.rank(result)
+        store.finish(result)
         if progress is not None:
             progress(done, len(waiting))
-    return len(waiting)
+    return len(rows)
 
 
 def season_rankings(
@@ -320,7 +270,7 @@ def ranking_facts(
             {
                 **row_facts(row),
                 "methods_of_key": keys[row.entry.key].methods,
-                "entrants_of_key": keys[row.entry.key].entrants,
+                "entries_of_key": keys[row.entry.key].entries,
             }
             for row in rows
         ]
@@ -331,10 +281,7 @@ def ranking_facts(
 def scored_entries(
     store: SeasonStore, season: Season, master: Master, rows: Sequence[SealedRow]
 ) -> Iterator[SealedResult]:
-    """The results of offline entries, from their answers, in order.
-
-    Several at a time are scored on each instance, whose optimum takes most of the time.
-    """
+    """The results of offline entries, from their answers, in order; several at a time."""
     for first in range(0, len(rows), _AT_A_TIME):
         yield from _scored_at_once(store, season, master, rows[first : first + _AT_A_TIME])
 
@@ -355,9 +302,7 @@ def _scored_at_once(
         yield sealed_result(season, row.entrant.id, of_entry, used, draws, rules=rules)
 
 
-def _read(
-    store: SeasonStore, instance: HiddenTask, answer: Artefact | None
-) -> tuple[Float32 | None, str | None]:
+def _read(store: SeasonStore, instance: HiddenTask, answer: Artefact | None) -> Answered:
     if answer is None:
         return None, None
     data = store.objects.read(answer.sha256)
@@ -397,58 +342,7 @@ def _score_together(
 ) -> tuple[Scores, bool]:
     """The scores of all runs of some tickets of a season, and whether they are oracle-like."""
     season = store.season(digest)
-    runs = [result.runs for result in _results(store, rows)]
-    groups = groups_of_season(season, runs)
-    scores = method_scores(groups, store.document.draws, season.digest)
-    return scores, is_oracle_like(scores, store.document.rules, _all(runs))
-
-
-def _results(store: SeasonStore, rows: Iterable[SealedRow]) -> Iterator[SealedResult]:
-    for row in rows:
-        result = store.sealed_result(row)
-        if result is not None:
-            yield result
-
-
-def _all(runs: Iterable[Iterable[RunScore]]) -> list[RunScore]:
-    return [run for each in runs for run in each]
-
-
-# With few state channels a table of states, of which the nearest answer, fills the cube.
-EASY = 0.1
-"""Below it a table leaves little to learn."""
-
-MOST_ROWS = 10_000
-_NEIGHBOURS = (1, 8)
-_SEEDS = (0, 1)  # public: nothing is measured on hidden tasks
-_QUESTIONS = 300
-
-
-def table_regret(setting: Setting, rows: int) -> float:
-    """The normalised regret N₀ within the cube of a table of random states and their optima.
-
-    Args:
-      setting: of a class.
-      rows: size of the data set, or steps of the budget; at most `MOST_ROWS` are taken.
-
-    Returns:
-      The mean over public tasks of this setting, of the better of the nearest state's optimum and
-      the mean of the eight nearest ones. Labels are exact, so data with noise do worse.
-    """
-    return float(np.mean([_regret(setting, rows, seed) for seed in _SEEDS]))
-
-
-def _regret(setting: Setting, rows: int, seed: int) -> float:
-    from scipy.spatial import cKDTree
-
-    task = materialize(SMESpec.from_dict({**setting.to_dict(), "seed": seed}))
-    random = np.random.default_rng(seed)
-    states = random.random((min(rows, MOST_ROWS), setting.state_dim))
-    asked = random.random((_QUESTIONS, setting.state_dim))
-    labels, optimum = task.optimal_action(states), task.optimal_action(asked)
-    tree = cKDTree(states)
-    errors = []
-    for count in _NEIGHBOURS:
-        _, nearest = tree.query(asked, range(1, min(count, len(states)) + 1))
-        errors.append(np.abs(labels[nearest].mean(axis=1) - optimum).mean())
-    return float(min(errors) / np.abs(0.5 - optimum).mean())
+    runs = [result.runs for result in map(store.sealed_result, rows) if result is not None]
+    scores = method_scores(_groups(season, runs), store.document.draws, season.digest)
+    every = [run for each in runs for run in each]
+    return scores, is_oracle_like(scores, store.document.rules, every)

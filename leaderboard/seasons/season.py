@@ -14,6 +14,10 @@ nothing of the master or of the others.
 
     sealed-offline   entrants learn from published data sets, and act in challenge states
     sealed-online    each ticket has hidden instances of its own, which the board's server steps
+
+What entrants sign: an `Entry` names the answers, for each hidden instance one .npy file of float32
+actions `[regions · n, A]` in the challenge states, in their order. A `TicketRequest` starts a
+ticket; the transcript of each instance follows, signed by a key that the request names.
 """
 
 from __future__ import annotations
@@ -30,15 +34,21 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_serializer, field_validator, model_validator
 
-from leaderboard.documents.board import Folder, hex_of
 from leaderboard.documents.result import ClassScore, RunScore, Scores
-from leaderboard.documents.signed import PublicKey, parse_secret, plain_json, write_secret
-from leaderboard.documents.submission import SafeName, UtcTime
+from leaderboard.documents.signed import (
+    PublicKey,
+    Signable,
+    parse_secret,
+    plain_json,
+    write_secret,
+)
+from leaderboard.documents.submission import Artefact, Manifest, Method, SafeName, UtcTime
 from leaderboard.errors import BoardError, Rejection
 from sme_registry.errors import ActionError, WireError
 from sme_registry.io import read_regular, sha256_of
+from sme_registry.seasons.transcript import Count, Head, TicketHeads
 from sme_registry.seasons.wire import unpack_table
 from sme_registry.spec import EvaluationProtocol, Setting
 from sme_registry.spec.document import (
@@ -63,7 +73,6 @@ MAX_LANES = 256
 """Of an instance that the server steps: the most copies that one request advances."""
 
 SealedTrack = Literal["sealed-offline", "sealed-online"]
-
 Float32 = npt.NDArray[np.float32]
 
 
@@ -147,7 +156,8 @@ class Terms(Document):
       opens, closes: entries count, and tickets start, from the first moment up to the second.
       protocol_name, protocol: the regions and numbers of the challenge states; its seed is 0, as
         the seed of each instance's states is secret.
-      ticket_hours: time from the start of a ticket to its deadline; null offline.
+      ticket_hours: time from the start of a ticket to its deadline, such as 0.5 for a rehearsal;
+        null offline.
       tickets, tickets_per_key: the most tickets of the season, and of one key; null offline.
       published: of each instance in order; empty online.
       versions: of the organiser's packages, by which data sets are rounded.
@@ -164,7 +174,7 @@ class Terms(Document):
     closes: UtcTime
     protocol_name: Name
     protocol: EvaluationProtocol
-    ticket_hours: Annotated[Integer | None, Field(ge=1, le=8760)] = None
+    ticket_hours: Annotated[Real | None, Field(ge=0.01, le=8760)] = None
     tickets: Annotated[Integer | None, Field(ge=1, le=100_000)] = None
     tickets_per_key: Annotated[Integer | None, Field(ge=1, le=1000)] = None
     published: Annotated[tuple[Digests, ...], Field(strict=False, max_length=MAX_INSTANCES)] = ()
@@ -177,30 +187,26 @@ class Terms(Document):
         if len(set(names)) < len(names):
             raise ValueError(f"classes={names}: must have different names. Rename one.")
         count = sum(member.instances for member in self.classes)
-        online = self.track == "sealed-online"
-        most = MAX_INSTANCES if online else MAX_OFFLINE_INSTANCES
+        most = MAX_INSTANCES if self.track == "sealed-online" else MAX_OFFLINE_INSTANCES
         if count > most:
             raise ValueError(
                 f"classes: have {count:,} instances: must be at most {most:,} together on the "
                 f"track {self.track}. Use fewer."
             )
-        for member in self.classes:
-            for field, wanted in (("budget", online), ("data", not online)):
-                if (getattr(member, field) is not None) != wanted:
-                    raise ValueError(
-                        f"classes.{member.name}.{field}: must be "
-                        f"{'given' if wanted else 'null'} on the track {self.track}."
-                    )
         return self
 
     @model_validator(mode="after")
     def _track_fits(self) -> Self:
         online = self.track == "sealed-online"
-        for field in ("ticket_hours", "tickets", "tickets_per_key"):
-            if (getattr(self, field) is not None) != online:
-                raise ValueError(
-                    f"{field}: must be {'given' if online else 'null'} on the track {self.track}."
-                )
+        own = ("ticket_hours", "tickets", "tickets_per_key")
+        fields = [(name, getattr(self, name), online) for name in own]
+        for member in self.classes:
+            fields.append((f"classes.{member.name}.budget", member.budget, online))
+            fields.append((f"classes.{member.name}.data", member.data, not online))
+        for field, value, wanted in fields:
+            if (value is not None) != wanted:
+                must = "given" if wanted else "null"
+                raise ValueError(f"{field}: must be {must} on the track {self.track}.")
         listed = [(each.class_name, each.instance) for each in self.published]
         hidden = [] if online else [(each.member.name, each.instance) for each in self.hidden]
         if listed != hidden:
@@ -234,6 +240,10 @@ class Terms(Document):
                 "each instance from its secret. Leave it out."
             )
         return protocol
+
+    @field_serializer("ticket_hours")
+    def _as_in_earlier_files(self, hours: float | None) -> int | float | None:
+        return int(hours) if hours is not None and hours.is_integer() else hours
 
     @property
     def hidden(self) -> Iterator[Hidden]:
@@ -271,13 +281,7 @@ class Season(Terms):
 
 
 class Admitted(Document):
-    """That the organiser admits a key to a season.
-
-    Attributes:
-      season: digest of the season.
-      key: the entrant's.
-      name: of the entrant, as the season shows it.
-    """
+    """That the organiser admits a key to a season, under the name that the season shows."""
 
     schema_version: SchemaVersion = 1
     season: Digest
@@ -286,16 +290,89 @@ class Admitted(Document):
 
 
 class Reveal(Document):
-    """`reveal.json`: the master, published after the season's close.
-
-    Attributes:
-      season: digest of the season.
-      master: 64 hex digits.
-    """
+    """`reveal.json`: the master of a season, published after its close."""
 
     schema_version: SchemaVersion = 1
     season: Digest
     master: Annotated[str, matching(r"^[0-9a-f]{64}$", "a master secret, 64 hex digits")]
+
+
+class SealedManifest(Manifest):
+    """What every entrant of a season signs.
+
+    Attributes:
+      season: digest of the season.
+    """
+
+    season: Digest
+
+    @field_validator("method")
+    @classmethod
+    def _has_no_oracle(cls, method: Method) -> Method:
+        if method.knowledge == "oracle":
+            raise ValueError(
+                "knowledge='oracle': must be 'generic' or 'family' in a sealed season, whose "
+                "optimal policies nobody but the organiser knows. Correct it."
+            )
+        return method
+
+
+class Entry(SealedManifest):
+    """The signed content of an offline entry.
+
+    Attributes:
+      answers: of each hidden instance; null where the method failed, which scores 1 there.
+    """
+
+    PURPOSE, FIELD, COMMAND = "entry", "entry", "enter"
+
+    answers: Annotated[
+        tuple[Artefact | None, ...],
+        Field(strict=False, min_length=1, max_length=MAX_OFFLINE_INSTANCES),
+    ]
+
+
+class TicketRequest(SealedManifest):
+    """The signed content of a request for a ticket.
+
+    Attributes:
+      nonce: 64 hex digits that the entrant has drawn at random, for this ticket alone. The tasks
+        depend on it, and on the ticket's number, which the board assigns later.
+      answers_key: signs what follows; null in requests that are older than it.
+      transcript: the version of the transcripts that it signs; null in requests that are older, of
+        which it signs `Answers`.
+    """
+
+    PURPOSE, FIELD, COMMAND = "ticket", "ticket", "ticket"
+    fields_added_later: ClassVar[tuple[str, ...]] = ("answers_key", "transcript")
+
+    nonce: Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits, drawn at random")]
+    answers_key: PublicKey | None = None
+    transcript: Literal[1] | None = None
+
+
+class InstanceHead(Signable, Head):
+    """Signed, it is `tickets/<number>/<instance>.json`, for the last signature of a transcript."""
+
+    PURPOSE, FIELD, COMMAND = "answers", "head", "answer"
+
+
+class AllHeads(Signable, TicketHeads):
+    """Signed, it is `tickets/<number>/end.json`."""
+
+    PURPOSE, FIELD, COMMAND = "answers", "end", "answer"
+
+
+class Answers(Signable):
+    """What was signed of an instance, in place of its head, before there were transcripts."""
+
+    PURPOSE, FIELD, COMMAND = "answers", "statement", "answer"
+
+    request: Digest  # id of the request for the ticket
+    ticket: Count
+    instance: Count
+    answers: Digest  # SHA-256 of the answers' .npy file
+    journal: Digest  # SHA-256 of the bodies of all requests for steps, in order
 
 
 def rows_of(protocol: EvaluationProtocol) -> int:
@@ -304,19 +381,7 @@ def rows_of(protocol: EvaluationProtocol) -> int:
 
 
 def read_answers(data: bytes, setting: Setting, protocol: EvaluationProtocol) -> Float32:
-    """The answers in the bytes of a file.
-
-    Args:
-      data: the file.
-      setting: of the hidden task.
-      protocol: of its season.
-
-    Returns:
-      `[regions · n, A]` finite actions, which are not clipped yet.
-
-    Raises:
-      Rejection: `answer_shape` or `answer_not_finite`.
-    """
+    """The answers in the bytes of a file: `[regions · n, A]`, finite, and not clipped yet."""
     try:
         return unpack_table(data, setting.action_dim, rows_of(protocol))
     except WireError as error:
@@ -325,65 +390,25 @@ def read_answers(data: bytes, setting: Setting, protocol: EvaluationProtocol) ->
         raise Rejection("answer_not_finite", str(error)) from None
 
 
-STEPPING = ".stepping"
-
-
-class SeasonFolder:
-    """The paths of a season's files; creates and reads nothing by itself.
-
-        published/         data sets and challenge states of an offline season
-        tickets/<number>/  what was played of an online season, by the ticket's number
-        .stepping          the lock of the server that steps it
-
-    Args:
-      folder: the board's.
-      digest: of the season.
-    """
-
-    def __init__(self, folder: Folder, digest: str) -> None:
-        self.path = folder.seasons / hex_of(digest)
-        self.published = self.path / "published"
-        self.tickets = self.path / "tickets"
-        self.stepping = self.path / STEPPING
-
-    def ticket(self, number: int) -> Path:
-        """The folder of a ticket, by its number, 1 for the season's first."""
-        return self.tickets / str(number)
-
-
 class Stepping(Document):
-    """The steps taken on one instance of a ticket, as the board's journal has them.
-
-    Attributes:
-      steps: number taken; at most the budget.
-      normalised_online_regret: Σ regret / Σ regret of the constant ½ in the same states, over the
-        budget. Steps that were not taken count like the constant's.
-      learning_curve: the same over each of at most 100 equal parts of the budget, in order.
-      signed: digest of the file in which the entrant signed answers and journal; null without any.
-    """
+    """The steps taken on one instance of a ticket, as the board's journal has them."""
 
     fields_added_later: ClassVar[tuple[str, ...]] = ("signed",)
 
     steps: Annotated[Integer, Field(ge=0)]
+    # Σ regret / Σ regret of the constant ½ in the same states, over the budget, and over each of at
+    # most 100 equal parts of it. Steps that were not taken count like the constant's.
     normalised_online_regret: Annotated[Real, Field(ge=0)]
     learning_curve: Annotated[tuple[Real, ...], Field(strict=False, min_length=1, max_length=100)]
-    signed: Digest | None = None
+    signed: Digest | None = None  # of the file in which the entrant signed answers and journal
 
 
 class SealedResult(Document):
-    """The outcome of a sealed entry or ticket.
+    """The outcome of a sealed entry or ticket, by the id of the entry or of the request.
 
-    Attributes:
-      season: digest of the season.
-      subject: id of the entry, or of the request for the ticket.
-      runs: one on each hidden instance, in the season's order. Their `spec` is null, as is
-        `evaluation_seed`: until the reveal, neither is public. `artefact` is the digest of the
-        answers; null where there are none, and the run scores 1.
-      stepping: online of each run, in the same order; empty offline.
-      oracle_like: as in `Result`.
-      versions: of the packages on which the numbers depend.
-      signed: of a ticket that the entrant has ended, the digest of the file with the signature of
-        all its transcripts; null otherwise.
+    Its runs are one on each hidden instance, in the season's order. Their `spec` is null, as is
+    `evaluation_seed`: until the reveal, neither is public. `artefact` is the digest of the answers;
+    null where there are none, and the run scores 1. Online, `stepping` has as many entries.
     """
 
     fields_added_later: ClassVar[tuple[str, ...]] = ("signed",)
@@ -397,24 +422,16 @@ class SealedResult(Document):
     stepping: Annotated[tuple[Stepping, ...], Field(strict=False)] = ()
     oracle_like: bool = False
     versions: dict[str, str] = Field(default_factory=dict)
-    signed: Digest | None = None
+    signed: Digest | None = None  # of the file with the signature that ended a ticket
 
 
-SEAL = "sme-seal/1"
-BYTES = 32
+_SEAL, _BYTES = "sme-seal/1", 32
 Purpose = Literal["task", "states", "data", "starts", "token"]
 """An instance's seed, challenge states, data set and episode starts; the password of a ticket."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """Where a secret belongs.
-
-    Attributes:
-      season: the season's id.
-      class_name, instance: the class, and the number of the instance in it, from 0.
-      ticket, nonce: of the online track; empty offline.
-    """
+class Place(NamedTuple):
+    """Where a secret belongs: in a season, by its id; a ticket and its nonce, online."""
 
     season: str
     class_name: str
@@ -429,47 +446,39 @@ class Master:
 
     raw: bytes = dataclasses.field(repr=False)
 
-    def __post_init__(self) -> None:
-        if len(self.raw) != BYTES:
-            raise BoardError(f"master: has {len(self.raw)} bytes: must have {BYTES}.")
-
     @classmethod
     def generate(cls) -> Master:
         """A new master from the operating system's randomness."""
-        return cls(secrets.token_bytes(BYTES))
+        return cls(secrets.token_bytes(_BYTES))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Master:
-        """Read a master from a file.
-
-        Raises:
-          BoardError: the file is missing or contains no master.
-        """
+        """Read a master from a file."""
         try:
-            data = read_regular(Path(path), 4096)
+            raw = parse_secret(read_regular(Path(path), 4096))
+            reason = "" if len(raw) == _BYTES else f"{len(raw)} bytes, not {_BYTES}"
         except OSError as error:
-            raise _no_master(path, str(error.strerror)) from None
-        try:
-            return cls(parse_secret(data))
-        except (ValueError, BoardError):
-            raise _no_master(path, "not 64 hex digits") from None
+            reason = str(error.strerror)
+        except ValueError:
+            reason = "not 64 hex digits"
+        if reason:
+            raise BoardError(
+                f"{path}: no master secret: {reason}. `sme-leaderboard season new` creates one; "
+                "without it nobody can reveal the season."
+            )
+        return cls(raw)
 
     def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the master into a new file that only its owner can read.
-
-        Raises:
-          BoardError: the file exists (an overwritten master is lost) or cannot be written.
-        """
+        """Write the master into a new file that only its owner can read."""
         return write_secret(path, self.raw)
 
     def commitment_to(self, terms: bytes) -> str:
         """SHA-256 of the seal, this master and a season's terms: `sha256:` and 64 hex digits."""
-        return sha256_of(SEAL.encode() + self.raw + terms)
+        return sha256_of(_SEAL.encode() + self.raw + terms)
 
     def secret(self, purpose: Purpose, place: Place) -> bytes:
         """The 32 bytes for a purpose in a place."""
-        parts = [SEAL, purpose, place.season, place.class_name, place.instance]
-        message = plain_json([*parts, place.ticket, place.nonce])
+        message = plain_json([_SEAL, purpose, *place])
         return hmac.new(self.raw, message, hashlib.sha256).digest()
 
     def seed(self, place: Place, purpose: Purpose = "task") -> str:
@@ -483,10 +492,3 @@ class Master:
     def states_seed(self, place: Place) -> int:
         """The seed of an instance's challenge states, which are published, in [0, 2⁵³)."""
         return int.from_bytes(self.secret("states", place)[:8]) >> 11
-
-
-def _no_master(path: str | os.PathLike[str], reason: str) -> BoardError:
-    return BoardError(
-        f"{path}: no master secret: {reason}. `sme-leaderboard season new` creates one; without "
-        "it nobody can reveal the season."
-    )

@@ -16,35 +16,24 @@ import logging
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.documents.submission import shifted, utc
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.aggregation import failed_run
-from leaderboard.seasons.entry import AllHeads, has_signed
 from leaderboard.seasons.events import SealedRow
-from leaderboard.seasons.instance import Instance, storage
-from leaderboard.seasons.journal import Start, no_steps
-from leaderboard.seasons.scoring import HiddenTask, challenge, instances, score_run, sealed_result
-from leaderboard.seasons.season import MAX_LANES, Master, Place, SealedResult, Season
+from leaderboard.seasons.instance import Instance, has_signed, storage, write_whole
+from leaderboard.seasons.scoring import HiddenTask, score_runs, sealed_result
+from leaderboard.seasons.season import MAX_LANES, AllHeads, Master, Place, SealedResult, Season
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
 from sme_registry import seasons
 from sme_registry.errors import SMEError
-from sme_registry.io import (
-    file_lock,
-    parse_json,
-    read_regular,
-    sha256_of,
-    to_json,
-    write_atomically,
-)
-from sme_registry.seasons import wire
+from sme_registry.io import file_lock, parse_json, read_regular, sha256_of
 from sme_registry.seasons.transcript import Chain
 from sme_registry.seasons.wire import StepFormat, TicketStatus
 
@@ -64,26 +53,31 @@ class Ticket:
 
     def __init__(self, store: SeasonStore, season: Season, master: Master, row: SealedRow) -> None:
         self.number, self.id = row.number, row.entrant.id
-        self._season, self._master, self._clock = season, master, store.clock
+        self._season, self._master = season, master
+        self._clock, self._queue = store.clock, store.queue
         self._request = request = store.request_of(row)
-        self._nonce = request.content.nonce
-        place = Place(season.id, "", 0, str(row.number), self._nonce)
+        place = Place(season.id, "", 0, str(row.number), request.content.nonce)
         self._token = master.secret("token", place).hex()
         self.deadline = deadline(season, row)
         self._closed = row.result is not None
-        folder = store.season_folder(row.season).ticket(row.number)
+        folder = store.ticket_folder(row.season, row.number)
         self._end_path = folder / "end.json"
+        self._hidden = tuple(season.hidden)
         self.instances = tuple(
             Instance(
-                *(folder, self._chain(number), request, hidden.member, season.protocol),
-                *(partial(self.start, number), partial(self._states, number), self.check_running),
+                folder,
+                Chain(request=self.id, ticket=self.number, instance=number),
+                request,
+                hidden.member,
+                season.protocol,
+                partial(self.hidden, number),
+                self.check_running,
             )
-            for number, hidden in enumerate(season.hidden)
+            for number, hidden in enumerate(self._hidden)
         )
 
     @property
     def document(self) -> seasons.Ticket:
-        """What the entrant gets; it holds the password."""
         return seasons.Ticket.from_dict(
             {
                 "season": self._season.id,
@@ -137,20 +131,18 @@ class Ticket:
             receiver = self._request.receiver._asdict()
             signed = Signed[AllHeads](content=heads, signature=signature, **receiver)
             with storage():
-                write_atomically(self._end_path, to_json(signed.to_dict()))
+                write_whole(self._end_path, signed.to_bytes())
 
     @property
     def _heads(self) -> AllHeads:
-        heads = []
-        for number, instance in enumerate(self.instances):
-            head = instance.final_head()
-            if head is None:
-                raise Rejection(
-                    "instance_phase",
-                    f"instance={number}: has no answers. Answer it before the ticket's end.",
-                )
-            heads.append(head)
-        return AllHeads(request=self.id, ticket=self.number, heads=tuple(heads))
+        heads = tuple(filter(None, (each.final_head for each in self.instances)))
+        if len(heads) < len(self.instances):
+            raise Rejection(
+                "instance_phase",
+                f"instances: {len(heads)} of {len(self.instances)} have answers. Answer all of "
+                "them before the ticket's end.",
+            )
+        return AllHeads(request=self.id, ticket=self.number, heads=heads)
 
     @property
     def is_ended(self) -> bool:
@@ -176,11 +168,12 @@ class Ticket:
             return None
         return sha256_of(read_regular(self._end_path, MAX_BYTES))
 
-    def status(self, now: str, places: Mapping[str, int]) -> wire.TicketStatus:
-        """How far the entrant is; `places` are those of all that waits to be scored."""
-        return wire.TicketStatus(
+    @property
+    def status(self) -> TicketStatus:
+        places = self._queue.places()
+        return TicketStatus(
             ticket=self.number,
-            phase="ended" if self.is_over(now) else "running",
+            phase="ended" if self.is_over(self._clock.time) else "running",
             deadline=self.deadline,
             instances=tuple(each.status for each in self.instances),
             place=places.get(self.id, 0),
@@ -188,7 +181,6 @@ class Ticket:
         )
 
     def instance(self, number: int) -> Instance:
-        """Instance i of the ticket."""
         if number >= len(self.instances):
             raise Rejection(
                 "instance_unknown",
@@ -197,27 +189,8 @@ class Ticket:
         return self.instances[number]
 
     def hidden(self, number: int) -> HiddenTask:
-        """What is hidden of instance i."""
-        every = instances(self._season, self._master, str(self.number), self._nonce)
-        return next(islice(every, number, None))
-
-    def start(self, number: int) -> Start:
-        """What the steps of instance i follow from."""
-        hidden = self.hidden(number)
-        seed = int.from_bytes(self._master.secret("starts", hidden.place))
-        return Start(hidden.spec, seed, self._chain(number))
-
-    def _chain(self, number: int) -> Chain:
-        return Chain(request=self.id, ticket=self.number, instance=number)
-
-    def _states(self, number: int) -> bytes:
-        hidden = self.hidden(number)
-        return wire.pack_table(challenge(hidden.spec, hidden.protocol))
-
-    def forget(self) -> None:
-        """Remove what only playing and scoring needed."""
-        for each in self.instances:
-            each.forget()
+        nonce, hidden = self._request.content.nonce, self._hidden[number]
+        return HiddenTask.of(self._season, self._master, hidden, str(self.number), nonce)
 
     def close(self) -> None:
         """End the ticket: wait for the requests in progress, and refuse all others."""
@@ -235,22 +208,25 @@ def score_ticket(
     """
     runs, stepping = [], []
     versions: dict[str, str] = {}
-    for index, instance in enumerate(ticket.instances):
-        answers, digest = instance.answers
-        run, used = score_run(ticket.hidden(index), answers, digest, store.document.rules)
-        runs.append(run)
-        versions |= used
-        stepping.append(instance.replayed() if replay else instance.stepping())
     draws, rules = store.document.draws, store.document.rules
+    for number, (instance, hidden) in enumerate(zip(ticket.instances, season.hidden, strict=True)):
+        answered = instance.answers
+        run = failed_run(season.protocol, hidden.member.name, None)
+        if answered[0] is not None:
+            [(run, used)] = score_runs(ticket.hidden(number), [answered], rules)
+            versions |= used
+        runs.append(run)
+        stepping.append(instance.replayed() if replay else instance.stepping())
     result = sealed_result(season, ticket.id, runs, versions, draws, stepping, rules)
     return result.model_copy(update={"signed": ticket.end_digest})
 
 
-def unplayed_result(store: SeasonStore, season: Season, ticket: Ticket) -> SealedResult:
-    """What `score_ticket` computes for a ticket of which nothing is signed, and at no cost."""
-    runs = [failed_run(season.protocol, hidden.member.name, None) for hidden in season.hidden]
-    stepping = [no_steps(each.budget, each.status.lanes or 1) for each in ticket.instances]
-    return sealed_result(season, ticket.id, runs, {}, store.document.draws, stepping)
+def finish_ticket(store: SeasonStore, season: Season, ticket: Ticket) -> None:
+    """Score a ticket that is over, and log its result."""
+    not_before = "" if ticket.is_ended else ticket.deadline
+    store.finish(score_ticket(store, season, ticket), not_before)
+    for each in ticket.instances:
+        each.forget()
 
 
 MOST_HELD_LANES, _FIXED_LANES, _WEIGHTS_OF_A_LANE = 2**17, 128, 100
@@ -261,29 +237,17 @@ Those used longest ago go on from their snapshots.
 
 
 class Sessions:
-    """The tickets of one season, for any number of threads; `close` frees the season.
+    """The tickets of one season, for any number of threads; `close` frees the season."""
 
-    `secret` is the path of its master, and `season` its digest; by default it is the first that is
-    committed to the master.
-    """
-
-    def __init__(
-        self, store: SeasonStore, secret: str | os.PathLike[str], season: str | None = None
-    ) -> None:
-        self.master = Master.read(secret)
-        seasons = _seasons_of(store, self.master, secret)
-        self.season = seasons[0] if season is None else store.season(season)
-        self.digest = self.season.digest
+    def __init__(self, store: SeasonStore, season: Season, master: Master) -> None:
+        self.season, self.master, self.digest = season, master, season.digest
         folder = store.season_folder(self.digest)
-        folder.path.mkdir(parents=True, exist_ok=True)
-        lock = file_lock(folder.stepping)
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = file_lock(folder / ".stepping")
         if lock is None:
-            raise BoardError(
-                f"season={self.season.id}: another server steps it. Stop that one first."
-            )
+            raise BoardError(f"season={season.id}: another server steps it. Stop that one first.")
         self._process_lock = lock
         self._store = store
-        self.secret = Path(secret)
         self._lock = threading.Lock()
         self._running: dict[int, Ticket] = {}
         self._held: OrderedDict[Instance, int] = OrderedDict()
@@ -291,12 +255,18 @@ class Sessions:
 
     @classmethod
     def of_master(cls, store: SeasonStore, secret: str | os.PathLike[str]) -> list[Sessions]:
-        """Those of each online season that is committed to a master; errors as of the class."""
-        seasons = _seasons_of(store, Master.read(secret), secret)
-        return [cls(store, secret, season.digest) for season in seasons]
+        """Those of each online season that is committed to the master in a file."""
+        master = Master.read(secret)
+        online = [store.season(row.id) for row in store.seasons() if row.track == "sealed-online"]
+        found = [cls(store, each, master) for each in online if each.is_committed_to(master)]
+        if not found:
+            raise BoardError(
+                f"{secret}: is the master of no sealed-online season of this board. Give the file "
+                "that `sme-leaderboard season new` wrote."
+            )
+        return found
 
     def ticket(self, number: int) -> Ticket:
-        """A ticket by its number."""
         found = self._running.get(number)
         if found is None:
             row = self._store.ticket(self.digest, number)
@@ -311,29 +281,16 @@ class Sessions:
         dims = (member.setting.action_dim for member in self.season.classes)
         return StepFormat(MAX_LANES, 1, max(dims)).request_bytes
 
-    def status(self, number: int, token: str) -> TicketStatus:
-        """How far an entrant is, with the password of the ticket."""
+    def open(self, number: int, token: str) -> Ticket:
         ticket = self.ticket(number)
         ticket.check_token(token)
-        return ticket.status(self._store.clock.time, self._store.queue.places())
-
-    def open(self, number: int, token: str, instance: int) -> Instance:
-        """An instance, with the password of its ticket."""
-        ticket = self.ticket(number)
-        ticket.check_token(token)
-        return ticket.instance(instance)
+        return ticket
 
     def is_ready(self, number: int, instance: int) -> bool:
         """Whether the next step of an instance does not block."""
         ticket = self._running.get(number)
         instances = () if ticket is None else ticket.instances
         return instance < len(instances) and instances[instance].is_ready
-
-    def end(self, number: int, token: str, signature: str) -> None:
-        """`Ticket.end`, with the password of the ticket."""
-        ticket = self.ticket(number)
-        ticket.check_token(token)
-        ticket.end(signature)
 
     def over(self) -> list[int]:
         """The numbers of tickets that are over and have no result, in order."""
@@ -362,15 +319,12 @@ class Sessions:
                 ticket.close()
             self._store.queue.add_jobs(each.id for each in over if not each.is_unplayed)
             for ticket in [each for each in over if each.is_unplayed][:_AT_ONCE]:
-                result = unplayed_result(self._store, self.season, ticket)
-                self._store.end_ticket(self.digest, ticket.number, result, ticket.deadline)
-                ticket.forget()
+                finish_ticket(self._store, self.season, ticket)
         except Exception as error:  # the board is locked, or has no memory or files left
             # Nothing but the kind of an error is logged: its text may name what is hidden.
             _log.error("season: cannot be attended to: %s", type(error).__name__)
 
     def sync(self) -> None:
-        """Make all steps taken survive a loss of power."""
         with self._lock:
             held = list(self._held)
         for each in held:
@@ -399,17 +353,6 @@ class Sessions:
                 freed.append(oldest)
         for each in freed:
             each.release()
-
-
-def _seasons_of(store: SeasonStore, master: Master, secret: str | os.PathLike[str]) -> list[Season]:
-    online = [store.season(row.id) for row in store.seasons() if row.track == "sealed-online"]
-    found = [season for season in online if season.is_committed_to(master)]
-    if not found:
-        raise BoardError(
-            f"{secret}: is the master of no sealed-online season of this board. Give the file that "
-            "`sme-leaderboard season new` wrote."
-        )
-    return found
 
 
 _SECONDS = 1.0
@@ -454,8 +397,4 @@ class ScoreTicket:
         season = store.season(row.season)
         masters = map(Master.read, self.secrets)
         master = next(each for each in masters if season.is_committed_to(each))
-        ticket = Ticket(store, season, master, row)
-        not_before = "" if ticket.is_ended else ticket.deadline
-        result = score_ticket(store, season, ticket)
-        store.end_ticket(row.season, row.number, result, not_before)
-        ticket.forget()
+        finish_ticket(store, season, Ticket(store, season, master, row))

@@ -41,16 +41,11 @@ from leaderboard.seasons.tickets import Ticket, deadline, score_ticket
 def verify_seasons(
     store: SeasonStore, progress: Progress, published: Sequence[str | Path] = ()
 ) -> tuple[list[Row], list[Note]]:
-    """Verify all seasons of a board.
+    """Verify all seasons of a board, whose log was followed.
 
-    Args:
-      store: the board, whose log was followed.
-      progress: called with what was just checked.
-      published: folders as `season new` wrote them, of seasons whose board has no copy.
-
-    Raises:
-      TamperedError: names the first entry, ticket or value that does not follow.
-      BoardError: a published file differs from its digest.
+    `published` are folders as `season new` wrote them, of seasons whose board has no copy. A
+    `TamperedError` names the first entry, ticket or value that does not follow, a `BoardError` a
+    published file that differs from its digest.
     """
     folders = {read_season(folder).digest: Path(folder) for folder in published}
     rows, notes = [], []
@@ -76,14 +71,14 @@ class _SeasonVerifier:
     def __post_init__(self) -> None:
         self.season: Season = self.store.season(self.of.digest)
         self.entrants = self.store.entrants(self.of.digest)
+        self.is_online = self.season.track == "sealed-online"
 
     def check(self) -> None:
-        """Check all that can be checked now."""
         self.check_ends()
         for row in self.entrants:
             self.check_signature(row)
         self.report("signatures of entrants", len(self.entrants))
-        for result in self.results():
+        for result in filter(None, map(self.store.sealed_result, self.entrants)):
             refuse_contradiction(self.contradiction(result), self.name(result.subject))
         if self.of.reveal is None:
             self.check_published()
@@ -95,39 +90,34 @@ class _SeasonVerifier:
         self.score_again(master)
 
     def report(self, what: str, checked: int, unchecked: int = 0, why: str = "") -> None:
-        """Add a row of the table."""
         self.rows.append(Row(f"{self.of.id}: {what}", checked, unchecked, why))
 
     def name(self, subject: str) -> str:
         """What to call an entry or ticket, by its id."""
         return f"{self.of.id}, {subject}"
 
-    def results(self) -> Iterator[SealedResult]:
-        """The results, in the order of the entries."""
-        for row in self.entrants:
-            result = self.store.sealed_result(row)
-            if result is not None:
-                yield result
-
     def check_signature(self, row: SealedRow) -> None:
         """Check an entrant's signature, which the board's own key cannot forge."""
-        online = self.season.track == "sealed-online"
-        signed = self.store.request_of(row) if online else self.store.entry_of(row)
+        signed = self.store.request_of(row) if self.is_online else self.store.entry_of(row)
         if not signed.is_valid(self.store.document.key):
             self.refuse(row, "its signature does not match the entrant's key")
 
     def check_ends(self) -> None:
         """Check that no ticket ended early; all else that is forbidden no log can have."""
-        for row in self.entrants:
-            if row.result is None or row.entrant.policies == row.entrant.runs:
-                continue
-            if self.season.track == "sealed-online" and row.finished < deadline(self.season, row):
-                message = f"ended at {row.finished}, without all answers: must not be before "
-                self.refuse(row, f"{message}{deadline(self.season, row)}, its deadline")
+        for row in self.entrants if self.is_online else ():
+            if row.result is not None and row.entrant.policies < row.entrant.runs:
+                self.refuse_early(row, "without all answers")
+
+    def refuse_early(self, row: SealedRow, lack: str) -> None:
+        """Refuse a ticket that ended before its deadline, though something is lacking."""
+        end = deadline(self.season, row)
+        if row.finished < end:
+            self.refuse(
+                row, f"ended at {row.finished}, {lack}: must not be before {end}, its deadline"
+            )
 
     def published(self) -> Path | None:
-        """A folder with the published files; None without one."""
-        copy = self.store.season_folder(self.of.digest).published
+        copy = self.store.season_folder(self.of.digest) / "published"
         return copy if copy.is_dir() else self.folders.get(self.of.digest)
 
     def check_published(self) -> None:
@@ -139,7 +129,6 @@ class _SeasonVerifier:
         self.report("data sets, by their digests", check_published(self.season, folder))
 
     def generate_again(self, master: Master) -> None:
-        """Check that data sets and challenge states follow from the master."""
         if not self.season.published:
             return
         outcomes: Counter[str] = Counter()
@@ -160,7 +149,6 @@ class _SeasonVerifier:
             self.report("data sets, within 1e-6", rounded, 0, "this processor rounds otherwise")
 
     def score_again(self, master: Master) -> None:
-        """Score entries and tickets again, and compare."""
         counted = counting(self.store, self.season)
         scored = [row for row in self.entrants if row.result is not None]
         for row in scored:
@@ -188,21 +176,19 @@ class _SeasonVerifier:
 
     def has_answers(self, row: SealedRow) -> bool:
         """Whether the answers of an offline entry are here; those of a ticket lie beside it."""
-        if self.season.track == "sealed-online":
+        if self.is_online:
             return True
         answers = self.store.entry_of(row).content.answers
         return all(each is None or self.store.objects.has(each.sha256) for each in answers)
 
     def scored(self, master: Master, rows: Sequence[SealedRow]) -> Iterator[SealedResult]:
-        """The results, computed again."""
-        if self.season.track == "sealed-offline":
+        if not self.is_online:
             yield from scored_entries(self.store, self.season, master, rows)
             return
         for row in rows:
             ticket = Ticket(self.store, self.season, master, row)
-            if row.finished < ticket.deadline and not ticket.is_ended:
-                message = f"ended at {row.finished}, without the entrant's end: must not be before "
-                self.refuse(row, f"{message}{ticket.deadline}, its deadline")
+            if not ticket.is_ended:
+                self.refuse_early(row, "without the entrant's end")
             yield score_ticket(self.store, self.season, ticket, replay=True)
 
     def contradiction(self, result: SealedResult) -> Difference | None:
@@ -219,18 +205,10 @@ class _SeasonVerifier:
             if expected is None:
                 return Difference(f"runs.{number}", "other regions", "those of the protocol")
             runs.append(expected.model_copy(update={"class_name": name}))
-        again = sealed_result(
-            season,
-            result.subject,
-            runs,
-            result.versions,
-            board.draws,
-            result.stepping,
-            board.rules,
-        )
+        rest = result.versions, board.draws, result.stepping, board.rules
+        again = sealed_result(season, result.subject, runs, *rest)
         return contradiction(result, again.model_copy(update={"signed": result.signed}))
 
     def refuse(self, row: SealedRow, message: str) -> NoReturn:
-        """Raise `TamperedError` for an entry or ticket."""
-        kind = "ticket" if self.season.track == "sealed-online" else "entry"
+        kind = "ticket" if self.is_online else "entry"
         raise TamperedError(f"{self.of.id}: {kind} {row.number} ({row.entrant.id})", message)

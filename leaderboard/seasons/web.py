@@ -1,4 +1,4 @@
-"""Sealed seasons: `SeasonRoutes` over HTTP, whose messages `sme_registry.seasons.wire` defines.
+"""Sealed seasons: their pages, and `SeasonRoutes` over HTTP, as `sme_registry.seasons.wire` says.
 
     GET  /api/seasons                                           the board's seasons
     GET  /api/seasons/{id}                                      one season, its state and its reveal
@@ -6,15 +6,9 @@
     GET  /api/seasons/{id}/files?start=0                        a thousand of its public files
     GET  /api/seasons/{id}/files/{path}?start=0                 8 MiB of one
     POST /api/seasons/{id}/entries                              201 an offline entry, 200 known
-    POST /api/seasons/{id}/tickets                              201 a ticket, 200 the same again;
-                                                                signed, see `admission`
-    GET  /api/seasons/{id}/tickets/{n}                          its status
-    POST /api/seasons/{id}/tickets/{n}/instances/{i}/start      present observations
-    POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps      one step of all lanes
-    POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish     take no more steps
-    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge  challenge states
-    PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers    201 stored, 200 the same again
-    POST /api/seasons/{id}/tickets/{n}/end                      the ticket's end
+
+What is below `/api/seasons/{id}/tickets` is in `wire`; a ticket, and answers, are 201, or 200 if
+the same were sent before.
 
 Steps of an instance that is ready are taken in the event loop; what goes on from a snapshot or
 waits for the disk runs in threads.
@@ -23,33 +17,41 @@ waits for the disk runs in threads.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 from anyio import CapacityLimiter, to_thread
-from starlette.datastructures import Headers
+from markupsafe import Markup
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
-from starlette.types import Scope
 
+from leaderboard.documents.result import Metric
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.errors import Rejection
+from leaderboard.scoring.ranking import REASONS
 from leaderboard.scoring.worker import Job
-from leaderboard.seasons.admission import receive_entry, refuse_other_sender, start_ticket
-from leaderboard.seasons.entry import Entry, TicketRequest
-from leaderboard.seasons.events import SeasonRow
+from leaderboard.seasons.events import SealedRow, SeasonRow
 from leaderboard.seasons.instance import Instance
-from leaderboard.seasons.pages import SECTION
-from leaderboard.seasons.scoring import (
-    ranking_facts,
+from leaderboard.seasons.scoring import by_key, counting, ranking_facts, season_rankings
+from leaderboard.seasons.season import Entry, TicketRequest
+from leaderboard.seasons.store import (
+    SeasonStore,
+    enter,
+    refuse_other_season,
+    refuse_other_sender,
+    start_ticket,
 )
-from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import ScoreTicket, Sessions, attending
 from leaderboard.store import Store
+from leaderboard.web import charts
 from leaderboard.web.http import HTTP_CODES, RequestError, metric_of, read_body
+from leaderboard.web.pages import Pages, Section
+from leaderboard.web.tables import setting_text
 from sme_registry import seasons
 from sme_registry.io import open_regular, to_json
 
@@ -60,9 +62,84 @@ _WORKERS = 4  # threads that go on from snapshots and write answers
 _LARGEST = 2**31
 _FILES = 1000  # in a list
 _CHUNK = 2**23  # of a file
-_CURVE_POINTS = 40
-_RANKINGS_KEPT = 16
+_CURVE_POINTS = 40  # drawn
 _T = TypeVar("_T")
+
+
+def _files(pages: Pages) -> dict[str, Callable[[], str]]:
+    store = pages.store
+    assert isinstance(store, SeasonStore)
+    rows = store.seasons()
+    if not rows:
+        return {}
+    title = "Sealed seasons"
+    listed = functools.partial(
+        pages.render, "seasons.html", here="seasons.html", title=title, rows=rows
+    )
+    files = {f"seasons/{row.id}.html": functools.partial(_page, pages, store, row) for row in rows}
+    return {**files, "seasons.html": listed}
+
+
+SECTION = Section(("seasons.html", "Seasons"), Path(__file__).parent, _files)
+"""A list of the seasons, and the page of each, before, during and after it."""
+
+
+def _page(pages: Pages, store: SeasonStore, row: SeasonRow) -> str:
+    season = store.season(row.digest)
+    rankings = season_rankings(store, season, "wd_regret")
+    # The scorer of the reference rows has scored the entries, too.
+    if pages.preparing and any(rankings.values()):
+        return pages.preparation("../")
+    return pages.render(
+        "season.html",
+        here="",
+        root="../",
+        title=row.title,
+        reasons=REASONS,
+        row=row,
+        season=season,
+        online=row.track == "sealed-online",
+        settings=[setting_text(member.setting) for member in season.classes],
+        entrants=_entrants(store, row, {each.entrant.id for each in counting(store, season)}),
+        rankings=rankings,
+        keys=by_key(store, season),
+        master=store.revealed_master(row.digest).raw.hex() if row.reveal else "",
+    )
+
+
+def _entrants(store: SeasonStore, row: SeasonRow, counted: set[str]) -> list[dict[str, Any]]:
+    """The entries or tickets of a season, for their table."""
+    rows = store.entrants(row.digest)
+    stepped = [_stepped(store, each) for each in rows]
+    drawn = iter(charts.sparklines([curve for _, curve in stepped if curve], "From the first step"))
+    return [
+        {
+            "row": each,
+            "counts": each.entrant.id in counted,  # else, a later one of its method replaces it
+            "online_regret": regret,
+            "curve": next(drawn) if curve else Markup(""),
+        }
+        for each, (regret, curve) in zip(rows, stepped, strict=True)
+    ]
+
+
+@functools.lru_cache(4096)  # results may have megabytes, and never change
+def _stepped(store: SeasonStore, row: SealedRow) -> tuple[float | None, list[float]]:
+    """Of a ticket that has ended, the mean online regret, and the mean curve over the budget."""
+    result = store.sealed_result(row)
+    if result is None or not result.stepping:
+        return None, []
+    share = np.linspace(0.0, 1.0, _CURVE_POINTS)
+    curves = [each.learning_curve for each in result.stepping]
+    values = [np.interp(share, np.linspace(0.0, 1.0, len(curve)), curve) for curve in curves]
+    regret = np.mean([each.normalised_online_regret for each in result.stepping])
+    return float(regret), np.mean(values, axis=0).tolist()
+
+
+@functools.lru_cache(16)
+def _ranking(store: SeasonStore, season: str, metric: Metric, head: str) -> dict[str, Any]:
+    """The ranking of a season when the log had this head."""
+    return {**ranking_facts(store, store.season(season), metric)}
 
 
 class SeasonRoutes:
@@ -78,15 +155,16 @@ class SeasonRoutes:
     ) -> None:
         assert isinstance(store, SeasonStore)
         self._store, self._address = store, address
+        self._secrets = tuple(map(Path, secrets))
         self._sessions = {
-            each.season.id: each for path in secrets for each in Sessions.of_master(store, path)
+            each.season.id: each
+            for path in self._secrets
+            for each in Sessions.of_master(store, path)
         }
-        self._secrets = tuple(each.secret for each in self._sessions.values())
         self._threads = CapacityLimiter(_WORKERS)
         self._requests = CapacityLimiter(1)
         self._entries = CapacityLimiter(1)
         self._rankings = CapacityLimiter(1)
-        self._ranked: dict[tuple[str, str, str], bytes] = {}
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
@@ -142,23 +220,15 @@ class SeasonRoutes:
         name = request.path_params["season"]
         metric = metric_of(request)
 
-        def rank() -> bytes:
-            row = self._store.season_row(name)
-            facts = ranking_facts(self._store, self._store.season(row.digest), metric)
-            return to_json({**self._view(row), "metric": metric, "ranking": facts}).encode()
-
         def ranked() -> bytes:
-            key = name, metric, self._store.head.digest
-            if key not in self._ranked:
-                if len(self._ranked) >= _RANKINGS_KEPT:
-                    self._ranked.clear()
-                self._ranked[key] = rank()
-            return self._ranked[key]
+            row = self._store.season_row(name)
+            facts = _ranking(self._store, row.digest, metric, self._store.head.digest)
+            return to_json({**self._view(row), "metric": metric, "ranking": facts}).encode()
 
         return Response(await _run(ranked, self._rankings), media_type="application/json")
 
     async def get_files(self, request: Request) -> Response:
-        start = _start(request)
+        start = _query(request, "start", "0")
 
         def files() -> list[dict[str, Any]]:
             folder, parts = self._public_parts(request)
@@ -175,7 +245,7 @@ class SeasonRoutes:
         return JSONResponse({"files": listed[start:end], "next": more})
 
     async def get_file(self, request: Request) -> Response:
-        start, path = _start(request), request.path_params["path"]
+        start, path = _query(request, "start", "0"), request.path_params["path"]
 
         def read() -> bytes:
             folder, parts = self._public_parts(request)
@@ -191,10 +261,9 @@ class SeasonRoutes:
         return _octets(await self._in_thread(read))
 
     def _public_parts(self, request: Request) -> tuple[Path, list[str]]:
-        """The folder of a season, and those in it that are public."""
         row = self._store.season_row(request.path_params["season"])
         revealed = ["tickets"] if row.reveal else []
-        return self._store.season_folder(row.digest).path, ["published", *revealed]
+        return self._store.season_folder(row.digest), ["published", *revealed]
 
     def _view(self, row: SeasonRow) -> dict[str, Any]:
         return {
@@ -209,14 +278,15 @@ class SeasonRoutes:
         }
 
     async def post_ticket(self, request: Request) -> Response:
-        sessions = self.sessions_of(request.path_params["season"])
+        sessions = self._served(request)
         text = await read_body(request, MAX_BYTES, "ticket")
         header = request.headers.get("Authorization")
 
         def start() -> tuple[seasons.Ticket, bool]:
             signed = Signed[TicketRequest].read(text)
             refuse_other_sender(self._store, signed, header, self._address)
-            number, new = start_ticket(self._store, signed, sessions.digest, address=self._address)
+            refuse_other_season(signed, sessions.digest)
+            number, new = start_ticket(self._store, signed, self._address)
             return sessions.ticket(number).document, new
 
         ticket, new = await _run(start, self._requests)
@@ -229,29 +299,26 @@ class SeasonRoutes:
         # Garbage without a valid signature never waits with entries, whose check is longer.
         signed = await _run(lambda: Signed[Entry].read(text), self._requests)
 
-        def enter() -> bool:
-            season = self._store.season_row(name).digest
-            return receive_entry(self._store, signed, season, self._address)
+        def admit() -> bool:
+            refuse_other_season(signed, self._store.season_row(name).digest)
+            return enter(self._store, signed, address=self._address)
 
-        new = await _run(enter, self._entries)
+        new = await _run(admit, self._entries)
         return JSONResponse({"id": signed.id}, 201 if new else 200)
 
     async def get_ticket(self, request: Request) -> Response:
-        sessions = self.sessions_of(request.path_params["season"])
-        number, token = _small(request.scope, "ticket"), _token(request.scope)
-        status = await self._in_thread(lambda: sessions.status(number, token))
+        of = self._ticket(request)
+        status = await self._in_thread(lambda: of.sessions.open(of.number, of.token).status)
         return JSONResponse(status.to_dict())
 
+    async def end(self, request: Request) -> Response:
+        of, signature = self._ticket(request), _signature(request)
+        await self._in_thread(lambda: of.sessions.open(of.number, of.token).end(signature))
+        return Response()
+
     async def start(self, request: Request) -> Response:
-        text = request.query_params.get("lanes", "")
-        if not (text.isascii() and text.isdigit() and len(text) < 10):
-            raise RequestError("bad_request", f"lanes={text!r:.80}: must be a number. Correct it.")
-        lanes = int(text)
-
-        def start(instance: Instance) -> bytes:
-            return instance.start(lanes)
-
-        return _octets(await self._used(request, start))
+        lanes = _query(request, "lanes")
+        return _octets(await self._used(request, lambda instance: instance.start(lanes)))
 
     async def finish(self, request: Request) -> Response:
         await self._used(request, lambda instance: instance.finish(_signature(request)))
@@ -261,33 +328,30 @@ class SeasonRoutes:
         return _octets(await self._used(request, Instance.challenge))
 
     async def answer(self, request: Request) -> Response:
-        sessions, where = self.place(request.scope)
-        instance = await self._in_thread(lambda: sessions.open(*where))
-        data = await read_body(request, instance.answer_bytes, "answers")
-        new = await self._in_thread(lambda: instance.answer(data, _signature(request)))
+        most = await self._used(request, lambda instance: instance.answer_bytes)
+        data = await read_body(request, most, "answers")
+        new = await self._used(request, lambda instance: instance.answer(data, _signature(request)))
         return Response(status_code=201 if new else 200)
 
     async def step(self, request: Request) -> Response:
-        sessions, where = self.place(request.scope)
-        body = await read_body(request, sessions.step_bytes, "steps")
+        of, number = self._ticket(request), _path_number(request, "instance")
+        body = await read_body(request, of.sessions.step_bytes, "steps")
         signature = _signature(request)
 
-        def step() -> bytes:
-            instance = sessions.open(*where)
-            answer = instance.step(body, signature)
-            sessions.hold(instance)
-            return answer
+        def step(instance: Instance) -> bytes:
+            return instance.step(body, signature)
 
-        is_ready = sessions.is_ready(where.ticket, where.instance)
-        return _octets(step() if is_ready else await self._in_thread(step))
+        if of.sessions.is_ready(of.number, number):
+            return _octets(of.use(number, step))
+        return _octets(await self._in_thread(lambda: of.use(number, step)))
 
-    async def end(self, request: Request) -> Response:
-        sessions = self.sessions_of(request.path_params["season"])
-        number, token = _small(request.scope, "ticket"), _token(request.scope)
-        await self._in_thread(lambda: sessions.end(number, token, _signature(request)))
-        return Response()
+    async def _used(self, request: Request, use: Callable[[Instance], _T]) -> _T:
+        """What a thread does with the instance that a request is for, whose ticket runs."""
+        of, number = self._ticket(request), _path_number(request, "instance")
+        return await self._in_thread(lambda: of.use(number, use))
 
-    def sessions_of(self, season: str) -> Sessions:
+    def _served(self, request: Request) -> Sessions:
+        season = request.path_params["season"]
         found = self._sessions.get(season)
         if found is not None:
             return found
@@ -301,58 +365,47 @@ class SeasonRoutes:
             "season_not_served", f"season={season}: {HTTP_CODES['season_not_served']}."
         )
 
-    def place(self, scope: Scope) -> tuple[Sessions, _Where]:
-        """The tickets and the instance that a request is for."""
-        parameters = scope["path_params"]
-        where = _Where(_small(scope, "ticket"), _token(scope), _small(scope, "instance"))
-        return self.sessions_of(parameters["season"]), where
-
-    async def _used(self, request: Request, use: Callable[[Instance], _T]) -> _T:
-        """What a thread does with the instance that a request is for, whose ticket runs."""
-        sessions, where = self.place(request.scope)
-
-        def work() -> _T:
-            instance = sessions.open(*where)
-            result = use(instance)
-            sessions.hold(instance)
-            return result
-
-        return await self._in_thread(work)
+    def _ticket(self, request: Request) -> _Ticket:
+        number = _path_number(request, "ticket")
+        token = request.headers.get("Authorization", "").removeprefix("Bearer ")
+        return _Ticket(self._served(request), number, token)
 
     async def _in_thread(self, work: Callable[[], _T]) -> _T:
         return await _run(work, self._threads)
+
+
+class _Ticket(NamedTuple):
+    """The ticket that a request is for, and the password that came with it."""
+
+    sessions: Sessions
+    number: int
+    token: str
+
+    def use(self, instance: int, use: Callable[[Instance], _T]) -> _T:
+        opened = self.sessions.open(self.number, self.token).instance(instance)
+        result = use(opened)
+        self.sessions.hold(opened)
+        return result
 
 
 async def _run(work: Callable[[], _T], limiter: CapacityLimiter) -> _T:
     return await to_thread.run_sync(work, limiter=limiter)
 
 
-def _start(request: Request) -> int:
-    text = request.query_params.get("start", "0")
+def _query(request: Request, name: str, default: str = "") -> int:
+    """A number of the query."""
+    text = request.query_params.get(name, default)
     if not (text.isascii() and text.isdigit() and len(text) < 16):
-        raise RequestError("bad_request", f"start={text!r:.80}: must be a number.")
+        raise RequestError("bad_request", f"{name}={text!r:.80}: must be a number. Correct it.")
     return int(text)
 
 
-class _Where(NamedTuple):
-    """An instance of a ticket, and the password that a request sent for it."""
-
-    ticket: int
-    token: str
-    instance: int
-
-
-def _small(scope: Scope, name: str) -> int:
+def _path_number(request: Request, name: str) -> int:
     """A number of the path; of more than nine digits, one that no ticket or instance has."""
-    text: str = scope["path_params"][name]
+    text: str = request.path_params[name]
     if not (text.isascii() and text.isdigit()):
         raise RequestError("not_found", f"{HTTP_CODES['not_found']}.")
     return int(text) if len(text) < 10 else _LARGEST
-
-
-def _token(scope: Scope) -> str:
-    """The password in the header `Authorization`; empty without one."""
-    return Headers(scope=scope).get("Authorization", "").removeprefix("Bearer ")
 
 
 def _signature(request: Request) -> str:

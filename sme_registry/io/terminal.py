@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import inspect
 import io
@@ -384,6 +385,11 @@ class CommandGroup(TyperGroup):
             raise typer.Exit(2) from None
         except BrokenPipeError:
             raise typer.Exit(_discard_output()) from None
+        except OSError as error:
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            failure(f"{error.filename!s:.80}…: {error.strerror}. Give a shorter name.")
+            raise typer.Exit(2) from None
         except KeyboardInterrupt as stopped:
             failure(str(stopped) or "interrupted: no file is incomplete.")
             raise typer.Exit(130) from None

@@ -8,7 +8,7 @@ beside the ticket's file, and signed (`transcript`).
 from __future__ import annotations
 
 import os
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -54,12 +54,10 @@ from sme_registry.seasons.wire import (
     unpack_table,
 )
 from sme_registry.spec import Setting, SMESpec
-from sme_registry.spec.document import StrictModel
 from sme_registry.spec.sme_spec import ActionRange
 from sme_registry.task.task import Action, Array, Mask, Observation
 
 TicketLike = Ticket | str | os.PathLike[str]
-_Document = TypeVar("_Document", bound=StrictModel)
 
 WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
 """Reference policies that are the same on each task."""
@@ -95,7 +93,6 @@ class Instance:
     ) -> None:
         ticket = ticket if isinstance(ticket, Ticket) else Ticket.read(ticket)
         member = ticket.place(instance).member
-        _check_address(ticket, server_address(url, insecure=insecure).url)
         self.setting: Setting = member.setting
         self.budget = member.budget
         self.number = 0
@@ -104,6 +101,12 @@ class Instance:
             raise OptionError(
                 "ticket: has no key to sign what is sent. Give the file that `sme-leaderboard "
                 "ticket` wrote."
+            )
+        address = server_address(url, insecure=insecure).url
+        if ticket.signer.address not in (None, address):
+            raise OptionError(
+                f"url={address!r:.80}: must be {ticket.signer.address}, where the ticket was "
+                "started: another server could take its steps."
             )
         self._ticket, self._instance, self._signer = ticket, instance, ticket.signer
         self._chain = Chain(request=ticket.signer.request, ticket=ticket.ticket, instance=instance)
@@ -225,7 +228,11 @@ class Instance:
     def status(self) -> TicketStatus:
         path = ticket_path(self._ticket.season, self._ticket.ticket)
         data = self._connection.request("GET", path, most=2**22)
-        return _parse_answer(TicketStatus, data)
+        try:
+            return TicketStatus.from_dict(parse_json(data, "answer"))
+        except (MalformedDocumentError, SpecError) as error:
+            message = f"the server's answer is invalid: {error} Check its version."
+            raise SealedError("wire", message) from None
 
     def __enter__(self) -> Instance:
         return self
@@ -262,15 +269,6 @@ class Instance:
         ticket = self._ticket
         path = instance_path(ticket.season, ticket.ticket, self._instance, action)
         return self._connection.request(method, path, body, most=most)
-
-
-def _check_address(ticket: Ticket, address: str) -> None:
-    own = None if ticket.signer is None else ticket.signer.address
-    if own not in (None, address):
-        raise OptionError(
-            f"url={address!r:.80}: must be {own}, where the ticket was started: another server "
-            "could take its steps."
-        )
 
 
 class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
@@ -477,12 +475,3 @@ def actions_in(states: Float32, policy: Any, setting: Setting) -> Float32:
 
 def _any_spec(setting: Setting) -> SMESpec:
     return SMESpec.from_dict({**setting.to_dict(), "seed": 0})
-
-
-def _parse_answer(kind: type[_Document], data: bytes) -> _Document:
-    try:
-        return kind.from_dict(parse_json(data, "answer"))
-    except (MalformedDocumentError, SpecError) as error:
-        raise SealedError(
-            "wire", f"the server's answer is invalid: {error} Check its version."
-        ) from None

@@ -1,13 +1,13 @@
 """What a sealed-online season's server and its clients send each other, and a client's connection.
 
-    POST /api/seasons/{id}/tickets                                       a ticket
-    GET  /api/seasons/{id}/tickets/{n}                                   its status
-    POST /api/seasons/{id}/tickets/{n}/instances/{i}/start?lanes=L       begin, or go on
-    POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps?signature=    one step of all lanes
-    POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish?signature=   take no more steps
-    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge           challenge states, .npy
-    PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers?signature=  an action for each, .npy
-    POST /api/seasons/{id}/tickets/{n}/end?signature=                    the ticket's end
+    POST /api/seasons/{id}/tickets                 a ticket
+    GET  …/tickets/{n}                             its status
+    POST …/tickets/{n}/instances/{i}/start?lanes=L begin, or go on
+    POST …/instances/{i}/steps?signature=          one step of all lanes
+    POST …/instances/{i}/finish?signature=         take no more steps
+    GET  …/instances/{i}/challenge                 challenge states, .npy
+    PUT  …/instances/{i}/answers?signature=        an action for each, .npy
+    POST …/tickets/{n}/end?signature=              the ticket's end
 
 Each but the first has the ticket's token as `Authorization: Bearer`. Every request may be repeated
 after a lost answer: none has a further effect. Numbers are little-endian; L are the lanes, S and A

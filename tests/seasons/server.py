@@ -58,7 +58,7 @@ class Server:
 
     def seed(self, instance):
         """The seed of an instance's first lane."""
-        return int.from_bytes(MASTER.secret("starts", self.hidden(instance).place))
+        return self.hidden(instance).starts
 
     def local(self, instance, lanes, action_range="unit"):
         """The hidden task of an instance here, at the start of its first episodes."""
@@ -70,8 +70,8 @@ class Server:
     def answers(self, instance):
         """The answers that the board has."""
         with SeasonStore.open(self.board.path, read_only=True) as store:
-            folder = store.season_folder(self.board.season.digest)
-        return np.load(folder.ticket(self.ticket.ticket) / f"{instance}.npy", allow_pickle=False)
+            folder = store.ticket_folder(self.board.season.digest, self.ticket.ticket)
+        return np.load(folder / f"{instance}.npy", allow_pickle=False)
 
 
 @contextlib.contextmanager

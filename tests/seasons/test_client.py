@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from leaderboard.seasons.scoring import challenge
 from leaderboard.seasons.store import SeasonStore
 from sme_registry import seasons
 from sme_registry.errors import (
@@ -25,7 +24,7 @@ from sme_registry.errors import (
 from sme_registry.evaluation.references import NAMES, OLD_NAMES
 from sme_registry.seasons import Instance, Ticket, wire
 from sme_registry.seasons.client import actions_in
-from sme_registry.seasons.wire import StepFormat
+from sme_registry.seasons.wire import StepFormat, unpack_table
 from sme_registry.spec import Setting
 from tests.leaderboard.seasons.playing import ROWS
 from tests.seasons.server import BUDGET, serving_season
@@ -280,7 +279,7 @@ def test_answers_are_the_policy_s_actions_in_the_challenge_states(server):
     with Instance(server.url, server.ticket) as first:
         status = first.status()
     hidden = server.hidden(1)
-    states = challenge(hidden.spec, hidden.protocol)
+    states = unpack_table(hidden.challenge, 5)
     assert np.allclose(server.answers(1), states[:, :2], atol=1e-7)
     assert [each.phase for each in status.instances] == ["waiting", "answered", "waiting"]
 
@@ -297,8 +296,8 @@ def played(server, steps=2):
 def signed_head(server):
     """What the board has of the entrant's last signature; None without any."""
     with SeasonStore.open(server.board.path, read_only=True) as store:
-        folder = store.season_folder(server.board.season.digest)
-    path = folder.ticket(server.ticket.ticket) / "0.json"
+        folder = store.ticket_folder(server.board.season.digest, server.ticket.ticket)
+    path = folder / "0.json"
     return json.loads(path.read_bytes())["head"] if path.exists() else None
 
 

@@ -8,14 +8,11 @@ import pytest
 from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
 from leaderboard.scoring.aggregation import run_metrics
 from leaderboard.scoring.ranking import rank_ranges
-from leaderboard.seasons.scoring import (
-    challenge,
-    instances,
-    score_run,
-    table_regret,
-)
+from leaderboard.seasons.publication import table_regret
+from leaderboard.seasons.scoring import instances, score_runs
 from leaderboard.seasons.season import Place
 from sme_registry import evaluate
+from sme_registry.seasons.wire import unpack_table
 from sme_registry.spec import Setting
 from tests.leaderboard.seasons.sealing import MASTER, tiny_season
 
@@ -92,10 +89,10 @@ def policy(observations):
 
 
 def test_answers_score_what_their_policy_scores():
-    shown = challenge(FIRST.spec, FIRST.protocol)
-    assert shown.shape == (FIRST.rows, 4) == (300, 4)
+    shown = unpack_table(FIRST.challenge, 4)
+    assert shown.shape == (300, 4)
     assert shown.dtype == np.float32
-    run, versions = score_run(FIRST, policy(shown), "sha256:" + "1" * 64)
+    [(run, versions)] = score_runs(FIRST, [(policy(shown), "sha256:" + "1" * 64)])
     report = evaluate(policy, FIRST.spec, FIRST.protocol)
     assert run.normalised_regret == tuple(region.normalised_regret for region in report.regions)
     assert run.similarity == tuple(region.similarity for region in report.regions)
@@ -111,9 +108,7 @@ def test_tasks_and_states_are_an_instances_own_and_a_tickets():
     assert len({each.protocol.seed for each in everyone}) == 6
     assert FIRST.place == Place(SEASON.id, "deep", 0, "1", "a" * 64)
     [again, _] = instances(SEASON, MASTER, "1", "a" * 64)
-    np.testing.assert_array_equal(
-        challenge(again.spec, again.protocol), challenge(FIRST.spec, FIRST.protocol)
-    )
+    assert again.challenge == FIRST.challenge
 
 
 # A table of the nearest states

@@ -22,7 +22,7 @@ from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket
 from leaderboard.web.server import listen, url_of
 from sme_registry import seasons
-from sme_registry.seasons.transcript import Transcript
+from sme_registry.seasons.transcript import Chain, Transcript
 from sme_registry.seasons.wire import StepFormat
 from tests.leaderboard.seasons.playing import LANES
 
@@ -149,9 +149,10 @@ def check(board, entrant, requests):
     with SeasonStore.open(board.path, read_only=True) as store:
         row = store.ticket(board.season.digest, number)
         ticket = Ticket(store, board.season, Master.read(board.secret), row)
-        folder = store.season_folder(board.season.digest).ticket(number)
-    start, form, expected = ticket.start(0), StepFormat(LANES, 2, 1), hashlib.sha256()
-    play = Play(start, LANES, 10**9)
+        folder = store.ticket_folder(board.season.digest, number)
+    hidden, form, expected = ticket.hidden(0), StepFormat(LANES, 2, 1), hashlib.sha256()
+    chain = Chain(request=ticket.id, ticket=number, instance=0)
+    play = Play(hidden.spec, hidden.starts, chain, LANES, 10**9)
     expected.update(play.started[8:])
     journal = Journal.open(folder / "0.journal")
     assert journal.requests == requests
@@ -161,4 +162,4 @@ def check(board, entrant, requests):
         for part in form.unpack_steps(play.take(body)):
             expected.update(part.tobytes())
     assert entrant.seen.digest() == expected.digest()
-    assert Transcript(entrant.ticket.path, start.chain, 1).head(requests) == play.head
+    assert Transcript(entrant.ticket.path, chain, 1).head(requests) == play.head

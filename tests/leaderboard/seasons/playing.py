@@ -12,11 +12,9 @@ import numpy as np
 from leaderboard.admission import upload_header
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
-from leaderboard.seasons.admission import start_ticket
-from leaderboard.seasons.entrant import request_ticket
-from leaderboard.seasons.entry import TicketRequest, signer_of
-from leaderboard.seasons.season import Season
-from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.entrant import request_ticket, signer_of
+from leaderboard.seasons.season import Season, TicketRequest
+from leaderboard.seasons.store import SeasonStore, start_ticket
 from leaderboard.seasons.tickets import Sessions, Ticket, score_ticket
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import (
@@ -89,26 +87,26 @@ class Played:
     def __init__(self, board, store):
         self.board, self.store = board, store
         self.key = SigningKey.generate()
-        self.sessions = Sessions(store, board.secret)
+        self.sessions = Sessions(store, board.season, MASTER)
         self.take_ticket()
 
     def take_ticket(self, nonce=0):
         """Start a ticket; what follows is of this one."""
         self.request = self.board.request(self.key, nonce)
         envelope = Signed[TicketRequest].read(self.request.to_bytes())
-        self.number, _ = start_ticket(self.store, envelope, self.board.season.digest)
+        self.number, _ = start_ticket(self.store, envelope)
         self.token = self.ticket.document.token
         self.heads = {}  # of each instance, from h_0 on
 
     def restart(self):
         """Let another server go on, after this one has stopped."""
         self.sessions.close()
-        self.sessions = Sessions(self.store, self.board.secret)
+        self.sessions = Sessions(self.store, self.board.season, MASTER)
 
     def kill(self):
         """Let another server go on, without a chance for this one to put anything aside."""
         self.sessions._process_lock.release()
-        self.sessions = Sessions(self.store, self.board.secret)
+        self.sessions = Sessions(self.store, self.board.season, MASTER)
 
     @property
     def ticket(self):
@@ -117,16 +115,16 @@ class Played:
     @property
     def folder(self):
         """Of the ticket."""
-        return self.store.season_folder(self.board.season.digest).ticket(self.number)
+        return self.store.ticket_folder(self.board.season.digest, self.number)
 
     def chain(self, instance):
         return Chain(request=self.request.id, ticket=self.number, instance=instance)
 
     def open(self, instance=0):
-        return self.sessions.open(self.number, self.token, instance)
+        return self.sessions.open(self.number, self.token).instance(instance)
 
     def status(self, instance=0):
-        return self.sessions.status(self.number, self.token).instances[instance]
+        return self.sessions.open(self.number, self.token).status.instances[instance]
 
     def start(self, lanes=LANES, instance=0):
         opened = self.open(instance)
@@ -164,9 +162,9 @@ class Played:
 
     def end(self):
         """Sign the heads of all instances, as the board has them."""
-        heads = [each.final_head() for each in self.ticket.instances]
+        heads = [each.final_head for each in self.ticket.instances]
         document = TicketHeads(request=self.request.id, ticket=self.number, heads=tuple(heads))
-        self.sessions.end(self.number, self.token, self.sign(document))
+        self.sessions.open(self.number, self.token).end(self.sign(document))
 
     def signature(self, instance=0):
         """The entrant's, of the transcript of an instance so far."""
@@ -182,8 +180,9 @@ class Played:
         """Score the ticket, and log its result; False if it has one."""
         season = self.board.season
         result = scored(self.store, season, self.number)
-        is_new = self.store.end_ticket(season.digest, self.number, result)
-        self.ticket.forget()
+        is_new = self.store.finish(result)
+        for each in self.ticket.instances:
+            each.forget()
         return is_new
 
 

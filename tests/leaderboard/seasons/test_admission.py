@@ -8,9 +8,8 @@ from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.verify import verify
-from leaderboard.seasons import admission as entries
-from leaderboard.seasons.entry import Entry
-from leaderboard.seasons.season import MAX_OFFLINE_INSTANCES
+from leaderboard.seasons import store as entries
+from leaderboard.seasons.season import MAX_OFFLINE_INSTANCES, Entry
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of
@@ -115,7 +114,7 @@ def test_the_same_answers_must_fit_each_class(store, key):
 
 def test_what_changes_between_the_check_and_the_record_is_checked_again(store, key, monkeypatch):
     signed, path = entry(store, key, GOOD, None), store.folder.object(sha256_of(GOOD))
-    room = "leaderboard.seasons.admission.check_entrant"
+    room = "leaderboard.seasons.store.check_entrant"
     with monkeypatch.context() as patch:  # as `gc` of another process
         patch.setattr(room, lambda *_: path.unlink())
         store.put_object(sha256_of(GOOD), [GOOD], by=key.public)
@@ -129,7 +128,7 @@ def test_what_changes_between_the_check_and_the_record_is_checked_again(store, k
         return check_answers(*arguments)
 
     check_answers = entries._check_answers
-    monkeypatch.setattr("leaderboard.seasons.admission._check_answers", taken)
+    monkeypatch.setattr("leaderboard.seasons.store._check_answers", taken)
     with pytest.raises(Rejection, match="name_taken"):
         send(store, signed, GOOD)
 

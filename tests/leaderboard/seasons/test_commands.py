@@ -20,6 +20,8 @@ from tests.leaderboard.test_cli import board_command, fails, good
 
 PLAN = "plan.json"
 ENTER = ("--method", "Test", "--submitter", "A Lab")
+OTHER = ("--key", "other.key")
+LONG = "x" * 300
 
 
 @pytest.fixture(autouse=True)
@@ -29,6 +31,7 @@ def _home(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
     SigningKey.generate().write("my.key")
+    SigningKey.generate().write("other.key")
     tiny_board(tmp_path / "board").close()
     fields = tiny_terms(id="autumn").to_dict()
     del fields["published"]
@@ -79,7 +82,7 @@ def test_a_season_is_played_from_the_command_line(later):
     wrong = fails(1, "season", "reveal", "board", "autumn", "--secret", "other.master")
     assert "reveal_mismatch" in wrong
     assert "1 entry scored" in good("season", "reveal", "board", "autumn")
-    assert "0 entries scored" in good("season", "reveal", "board", "autumn")
+    assert "1 entry scored" in good("season", "reveal", "board", "autumn")
     checked = counts("verify", "board")
     assert checked["autumn: data sets"] == (2, 0)
     assert checked["autumn: results, scored again"] == (1, 0)
@@ -87,10 +90,12 @@ def test_a_season_is_played_from_the_command_line(later):
     assert shown["state"] == "revealed"
     [row] = shown["ranking"]["generic"]
     assert (row["id"], row["first"], row["last"]) == (id, 1, 1)
-    assert (row["methods_of_key"], row["entrants_of_key"]) == (1, 1)
+    assert (row["methods_of_key"], row["entries_of_key"]) == (1, 1)
     assert shown["ranking"]["family"] == []
     assert "Test 1" in good("season", "show", "board", "autumn", "--metric", "ood_regret")
     assert "revealed" in good("season", "show", "board")
+    assert (shown["keys"], shown["entries"], shown["admitted"]) == (1, 1, None)
+    assert "None" not in good("season", "show", "board", "autumn")
 
 
 def test_a_class_that_a_table_solves_is_warned_of_and_a_false_plan_is_refused(tmp_path):
@@ -107,6 +112,19 @@ def test_a_class_that_a_table_solves_is_warned_of_and_a_false_plan_is_refused(tm
     assert "complexity=4: must be at least 5" in fails(2, "season", "new", "board", PLAN)
     assert not list(tmp_path.glob("*shallow*"))
     assert "season_unknown" in fails(1, "season", "show", "board", "winter")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("season", "show", LONG),
+        ("season", "reveal", "board", "autumn", "--secret", LONG),
+        ("ticket", "https://board.example", "winter", "--out", LONG, *ENTER),
+        ("enter", "board", "autumn", "{name}" + LONG + ".zip", *ENTER),
+    ],
+)
+def test_a_name_that_no_file_can_have_is_refused(season, arguments):
+    assert "too long. Give a shorter name." in fails(2, *arguments)
 
 
 def entered(*arguments):
@@ -162,21 +180,16 @@ def test_an_entry_is_sent_to_a_served_board(season):
         assert [row.entrant.id for row in store.entrants(read_season(season).digest)] == [id]
 
 
-def test_a_served_season_with_a_list_takes_the_keys_on_it():
+def test_keys_are_admitted_to_a_season_with_a_list():
     fields = {**json.loads(Path(PLAN).read_text()), "admission": "listed"}
     Path(PLAN).write_text(json.dumps(fields))
     good("season", "new", "board", PLAN)
     good("season", "publish", "board", "autumn")
-    key = SigningKey.read("my.key").public
-    enter = ("constant", *ENTER)
-    with serving(Path("board")) as url:
-        assert "not_admitted" in fails(1, "enter", url, "autumn", *enter)
-        good("season", "admit", "board", "autumn", key, "Listed Lab")
-        assert "Admitted before" in good("season", "admit", "board", "autumn", key, "Listed Lab")
-        good("enter", url, "autumn", *enter)
-    with SeasonStore.open("board", read_only=True) as store:
-        [row] = store.entrants(read_season("autumn").digest)
-    assert row.entrant.submitter == "Listed Lab"
+    admit = ("season", "admit", "board", "autumn")
+    for expected in ("Admitted: Listed Lab.", "Admitted before: Listed Lab."):
+        assert expected in good(*admit, SigningKey.read("my.key").public, "Listed Lab")
+    assert "not_admitted" in fails(1, "enter", "board", "autumn", "constant", *ENTER, *OTHER)
+    good("enter", "board", "autumn", "constant", *ENTER)
     shown = facts("show", "board", "autumn")
     assert (shown["admission"], shown["admitted"]) == ("listed", 1)
-    assert "key" in fails(2, "season", "admit", "board", "autumn", "abc", "A Lab")
+    assert "key" in fails(2, *admit, "abc", "A Lab")

@@ -38,12 +38,12 @@ def play(store, key, move):
     assert store.announce(offline)
     assert store.announce(online)
     assert store.enter(entry)
-    assert store.start_ticket(request) == 1
-    assert store.end_ticket(online.digest, 1, failed_result(online, request.id))
+    assert store.start_ticket(request) == (1, True)
+    assert store.finish(failed_result(online, request.id))
     move()
     for season in (offline, online):
         assert store.reveal(reveal(season))
-    assert store.rank(failed_result(offline, entry.id))
+    assert store.finish(failed_result(offline, entry.id))
     return offline, online
 
 
@@ -81,17 +81,15 @@ def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
     season = tiny_season(ONLINE)
     store.announce(season)
     first = signed_request(store, season, key, 1)
-    assert [store.start_ticket(first) for _ in range(2)] == [1, 1]
-    assert store.start_ticket(signed_request(store, season, key, 2)) == 2
+    assert [store.start_ticket(first) for _ in range(2)] == [(1, True), (1, False)]
+    assert store.start_ticket(signed_request(store, season, key, 2)) == (2, True)
     other = SigningKey.generate()
-    assert store.start_ticket(signed_request(store, season, other, 3)) == 3
+    assert store.start_ticket(signed_request(store, season, other, 3)) == (3, True)
     result = failed_result(season, first.id)
-    assert store.end_ticket(season.digest, 1, result)
-    assert not store.end_ticket(season.digest, 1, result)
-    with pytest.raises(ValueError, match="does not match"):
-        store.end_ticket(season.digest, 2, result)
-    with pytest.raises(Rejection, match="ticket_unknown"):
-        store.end_ticket(season.digest, 4, result)
+    assert store.finish(result)
+    assert not store.finish(result)
+    with pytest.raises(BoardError, match="is not on this board"):
+        store.finish(failed_result(season, "sha256:" + "0" * 64))
 
 
 @pytest.mark.parametrize("track", [OFFLINE, ONLINE])
@@ -135,7 +133,7 @@ def test_a_reveal_follows_the_close_and_the_tickets_and_matches(store, key, late
     later()
     with pytest.raises(Rejection, match="1 tickets run, the first of them number 1"):
         store.reveal(reveal(season))
-    store.end_ticket(season.digest, 1, failed_result(season, request.id))
+    store.finish(failed_result(season, request.id))
     assert store.reveal(reveal(season))
     assert not store.reveal(reveal(season))
     with pytest.raises(Rejection, match="season_revealed"):
@@ -163,19 +161,16 @@ def test_what_is_allowed_and_what_is_logged_are_of_the_same_moment(store, key, l
     assert row.entrant.received < season.closes
 
 
-def test_a_request_that_the_board_forged_or_that_was_signed_for_another_is_named(
-    store, tmp_path, key
-):
-    season = tiny_season(ONLINE)
-    signed = signed_request(store, season, key)
+@pytest.mark.parametrize("track", [OFFLINE, ONLINE])
+def test_what_the_board_forged_or_was_signed_for_another_is_named(store, tmp_path, key, track):
+    season = tiny_season(track)
+    entered = signed_entry(store, season, key, [None, None])
+    signed = entered if track == OFFLINE else signed_request(store, season, key)
     with tiny_board(tmp_path / "other") as other:
-        boards = {
-            store: signed.model_copy(update={"signature": "0" * 128}),
-            other: signed,
-        }
-        for board, request in boards.items():
+        forged = {store: signed.model_copy(update={"signature": "0" * 128}), other: signed}
+        for board, each in forged.items():
             board.announce(season)
-            board.start_ticket(request)
+            (board.enter if track == OFFLINE else board.start_ticket)(each)
             with pytest.raises(TamperedError, match="does not match the entrant's key"):
                 replayed(board)
 
@@ -233,13 +228,13 @@ def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path, key
     with after_every_death(lambda store: store.start_ticket(request)) as store:
         assert [row.number for row in store.entrants(online.digest)] == [1]
     with SeasonStore.open(tmp_path / "board") as store:
-        assert store.start_ticket(other) == 2
-        assert store.start_ticket(request) == 1
-        for number, each in ((1, request), (2, other)):
-            store.end_ticket(online.digest, number, failed_result(online, each.id))
+        assert store.start_ticket(other) == (2, True)
+        assert store.start_ticket(request) == (1, False)
+        for each in (request, other):
+            store.finish(failed_result(online, each.id))
     later()
     with after_every_death(lambda store: store.reveal(reveal(season))) as store:
         assert store.revealed_master(season.id) == MASTER
-    with after_every_death(lambda store: store.rank(failed_result(season, entry.id))) as store:
+    with after_every_death(lambda store: store.finish(failed_result(season, entry.id))) as store:
         assert [row.entrant.status for row in store.entrants(season.digest)] == ["scored"]
     verify(tmp_path / "board", board=SeasonStore)

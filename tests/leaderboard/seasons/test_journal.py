@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from leaderboard.errors import TamperedError
-from leaderboard.seasons.journal import Journal, Play, Start, no_steps
+from leaderboard.seasons.journal import Journal, Play, no_steps
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
 from sme_registry.seasons.transcript import Chain
@@ -151,19 +151,19 @@ def test_another_file_is_no_journal_and_a_journal_is_never_replaced(tmp_path):
 
 
 SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, seed=12)
-START = Start(SPEC, 5, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
+START = (SPEC, 5, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
 def measured(actions, budget):
     """The regret of actions `[requests, L, A]`, of which a snapshot is taken on the way."""
     lanes = actions.shape[1]
     form = StepFormat(lanes, SPEC.state_dim, SPEC.action_dim)
-    play = Play(START, lanes, budget)
+    play = Play(*START, lanes, budget)
     for number, each in enumerate(actions, start=1):
         play.take(form.pack(number, each))
         if number == len(actions) // 2:
             arrays = np.load(io.BytesIO(play.snapshot()), allow_pickle=False)
-            play = Play(START, lanes, budget)
+            play = Play(*START, lanes, budget)
             play.restore(arrays)
     play.sign()
     return play.stepping
@@ -174,7 +174,7 @@ def regrets(actions):
     rows, ends = np.zeros((len(actions), 2)), set()
     for lane in range(actions.shape[1]):
         env = SMEEnv(SPEC)
-        env.reset(seed=START.seed + lane)
+        env.reset(seed=START[1] + lane)
         for row, each in zip(rows, actions[:, lane], strict=True):
             half = env.task.regret(env.state, np.full(2, 0.5))
             *_, terminated, truncated, info = env.step(each)

@@ -9,10 +9,10 @@ import pytest
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.scoring.worker import Work, run_scorer
-from leaderboard.seasons.entry import signer_of
+from leaderboard.seasons.entrant import signer_of
 from leaderboard.seasons.scoring import instances
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.tickets import Sessions, Ticket
+from leaderboard.seasons.tickets import Sessions
 from sme_registry import SMEError, materialize, seasons
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import Chain, answers_head, challenge_head, next_head
@@ -25,17 +25,14 @@ KEY = SigningKey.generate()
 
 def secrets_of(board, store):
     """What must not be found: master, seeds and digests as texts and bytes, the task's numbers."""
-    row = store.ticket(board.season.digest, 1)
-    ticket = Ticket(store, board.season, MASTER, row)
-    nonce = store.request_of(row).content.nonce
+    nonce = store.request_of(store.ticket(board.season.digest, 1)).content.nonce
     texts = [MASTER.raw.hex()]
     raw = [MASTER.raw]
-    for number, hidden in enumerate(instances(board.season, MASTER, "1", nonce)):
-        start = ticket.start(number)
+    for hidden in instances(board.season, MASTER, "1", nonce):
         digits = str(hidden.spec.seed)[2:]
         texts += [digits, str(int(digits, 16)), hidden.spec.digest.removeprefix("sha256:")]
-        texts += [str(start.seed), f"{start.seed:x}", str(hidden.protocol.seed)]
-        raw += [start.seed.to_bytes(32), bytes.fromhex(digits.zfill(64))]
+        texts += [str(hidden.starts), f"{hidden.starts:x}", str(hidden.protocol.seed)]
+        raw += [hidden.starts.to_bytes(32), bytes.fromhex(digits.zfill(64))]
         task = materialize(hidden.spec)
         raw += [task.W[0].tobytes(), task.layers[0][0][0].tobytes()]
         texts += [repr(float(task.W[0, 0])), repr(float(task.layers[0][0][0, 0]))]
@@ -106,7 +103,7 @@ def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
     assert set(statuses) == {200, 201, 400, 403, 409, 422}
     with SeasonStore.open(board.path) as store:
         result = scored(store, board.season, 1)
-        store.end_ticket(board.season.digest, 1, result)
+        store.finish(result)
         searched = secrets_of(board, store)
     parts = {f"answer {i}": part for i, part in enumerate(answered)}
     parts["log"] = caplog.text.encode()
@@ -161,7 +158,7 @@ def test_what_holds_a_secret_shows_none(tmp_path):
     with playing(online_board(tmp_path)) as played:
         searched = secrets_of(played.board, played.store)
         ticket = played.ticket
-        holders = (MASTER, ticket, ticket.start(0), ticket.hidden(0), ticket.instance(0))
+        holders = (MASTER, ticket, ticket.hidden(0), ticket.instance(0))
         shown = [repr(each).encode() for each in (*holders, ticket.document)]
     assert not any(each in text for text in shown for each in searched)
     with pytest.raises((TypeError, pickle.PicklingError)):

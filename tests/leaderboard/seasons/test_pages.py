@@ -4,9 +4,9 @@ import pytest
 
 from leaderboard import admission
 from leaderboard.scoring.aggregation import failed_run
-from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.scoring import sealed_result
 from leaderboard.seasons.season import Reveal, Stepping
+from leaderboard.seasons.web import SECTION
 from leaderboard.web.pages import Pages
 from leaderboard.web.server import write_site
 from tests.leaderboard.clocks import move_clock
@@ -69,7 +69,7 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
     move_clock(monkeypatch)
     board.reveal(Reveal(season=OFFLINE.digest, master=MASTER.raw.hex()))
     for id in (last, fitted):
-        board.rank(result(OFFLINE, id))
+        board.finish(result(OFFLINE, id))
     after = page(board, "seasons/autumn.html")
     assert MASTER.raw.hex() in after.words
     generic, family = (after.words.index(f"Methods {text}") for text in ("without", "that declare"))
@@ -90,7 +90,7 @@ def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key):
     over = page(board, "seasons/winter.html").words
     assert "waits to be scored: place 1 of 1 in the queue" in over
     assert "running" not in over
-    board.end_ticket(ONLINE.digest, 1, result(ONLINE, request.id))
+    board.finish(result(ONLINE, request.id))
     ended = page(board, "seasons/winter.html")
     assert "0.625" in ended.words
     labels = [svg.get("aria-label", "") for svg in ended.all("svg")]
@@ -107,7 +107,7 @@ def test_a_season_is_shown_before_the_boards_reference_rows_but_not_its_scores(
         request = signed_request(board, ONLINE, key)
         board.start_ticket(request)
         assert "running" in page(board, "seasons/winter.html", address="http://board.test").words
-        board.end_ticket(ONLINE.digest, 1, result(ONLINE, request.id))
+        board.finish(result(ONLINE, request.id))
         prepares = page(board, "seasons/winter.html", address="http://board.test")
     assert "Preparing." in prepares.words
     assert "0.625" not in prepares.words

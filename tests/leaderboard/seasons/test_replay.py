@@ -73,7 +73,7 @@ def test_a_fetched_season_of_tickets_is_replayed_without_its_server(revealed, tm
 def test_altered_journals_and_answers_are_found(revealed, tmp_path):
     shutil.copytree(revealed.path, tmp_path / "board")
     with SeasonStore.open(tmp_path / "board", read_only=True) as store:
-        folder = store.season_folder(revealed.season.digest).ticket(1)
+        folder = store.ticket_folder(revealed.season.digest, 1)
         files = sorted(folder.iterdir())
         # A journal, challenge states, answers and their signature of each instance; and the end.
         assert len(files) == 9
@@ -241,7 +241,7 @@ def test_a_ticket_that_ended_early_without_all_answers_is_found(tmp_path, monkey
     board = online_board(tmp_path)
     with SeasonStore.open(board.path) as store:
         store.start_ticket(signed_request(store, board.season, key))
-        store.end_ticket(board.season.digest, 1, scored(store, board.season, 1))
+        store.finish(scored(store, board.season, 1))
         logged(monkeypatch, AFTERWARDS, store, *reveal(board))
         with pytest.raises(TamperedError, match="without all answers: must not be before"):
             replayed(store)

@@ -71,7 +71,7 @@ def test_a_ticket_is_started_stepped_and_answered(url, board):
     name = f"{__name__}:policy"
     assert "must contain {name}" in command(2, "answer", url, "ticket.json", name)
     shown = command(0, "answer", url, "ticket.json", name, "--instance", "deep-0")
-    assert "1 instances without answers" in shown
+    assert "1 instance without answers" in shown
     assert "error:" in command(2, "answer", url, "ticket.json", "runs/{name}/model.zip")
     assert "must be 'deep-0' or" in command(2, "answer", url, "ticket.json", name, "-i", "deep-2")
     assert "has ended" in command(0, "answer", url, "ticket.json", name)  # of the one that is left
@@ -106,7 +106,7 @@ def test_files_of_actions_answer_challenges_that_were_fetched(url, board):
     np.save("deep-0.npy", states[:, :1])
     command(0, *answer, "{name}.npy", "-i", "deep-0")
     with SeasonStore.open(board.path, read_only=True) as store:
-        folder = store.season_folder(board.season.digest).ticket(ticket.ticket)
+        folder = store.ticket_folder(board.season.digest, ticket.ticket)
     np.testing.assert_array_equal(np.load(folder / "0.npy", allow_pickle=False), states[:, :1])
 
 

@@ -12,7 +12,7 @@ from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entrant import request_ticket
-from leaderboard.seasons.entry import TicketRequest
+from leaderboard.seasons.season import TicketRequest
 from leaderboard.web import client
 from sme_registry.errors import OptionError
 from sme_registry.seasons import wire
