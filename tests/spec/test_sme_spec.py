@@ -262,7 +262,8 @@ def test_the_guides_vectors_of_digests_follow_from_its_rule():
     """By a second implementation: the rule of docs/guides/specs.md in a few lines."""
     guide = Path(__file__).parents[2] / "docs" / "guides" / "specs.md"
     lines = re.findall(r'^(\{"D".*\})\n(sha256:[0-9a-f]{64})$', guide.read_text("utf-8"), re.M)
-    young = {"rotation": 0, "safety": None, "observation": None}
+    blocks = ("safety", "observation", "shaping", "noise")
+    young = {"rotation": 0, **dict.fromkeys(blocks)}
     assert len(lines) == 3
     for text, digest in lines:
         spec = SMESpec.from_dict(json.loads(text))
