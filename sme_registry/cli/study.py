@@ -190,8 +190,7 @@ def report(
     so it may be run during the study.
 
     Maps of tasks with two state channels, and --explorers, need the models kept by `sme study run
-    --keep-models`. The page links to each explorer, a file of 60 kB or more. Loading a model can
-    run code: use only models whose author you trust.
+    --keep-models`. Loading a model can run code: use only models whose author you trust.
 
     Examples:
 
