@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from sme_registry.diagnosis import diagnose
     from sme_registry.evaluation import EvaluationReport, StreamReport, evaluate
     from sme_registry.export import export_onnx
+    from sme_registry.evaluation.values import values
     from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
     from sme_registry.studies import compare, run_study
     from sme_registry.studies import load as load_study
@@ -78,6 +79,7 @@ __all__ = [
     "save",
     "train",
     "train_offline",
+    "values",
 ]
 
 _LAZY = {
@@ -99,6 +101,7 @@ _LAZY = {
     "save": "sme_registry.task.loading.save",
     "train": "sme_registry.training.train",
     "train_offline": "sme_registry.datasets.train_offline",
+    "values": "sme_registry.evaluation.values.values",
 }
 
 # Not in `__all__`: a star import would load all of them, and with them optional dependencies.

@@ -426,15 +426,17 @@ class Batch:
         for env, count in enumerate(snapshot["begun"].tolist()):
             self.initial_states.skip(env, count)
 
-    def place(self, states: Array, t: Indices, accumulated: Array) -> None:
+    def place(
+        self, states: Array, t: Indices, accumulated: Array, distractors: Array | None = None
+    ) -> None:
         """Put every environment at any point of an episode; `observe` gives what is seen there.
 
-        States `[B, S]`, steps t `[B]` in [0, T) and r_cum `[B, n]`; distractors are drawn.
+        States `[B, S]`, steps t `[B]` in [0, T), r_cum `[B, n]`, distractors `[B, m]`; None draws.
         """
         self._s[:] = states.T
         self._t[:] = t
         self._accumulated[:] = accumulated.T
-        self._numbers.begin(self._envs)
+        self._numbers.begin(self._envs, distractors)
 
     def advance(self, actions: Array, resting: Mask | None = None) -> BatchStep:
         """One step, from actions `[B, A]` of the unit range, clipped; ActionError changes nothing.

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs.arguments import initial_states, single_agent
+from sme_registry.envs.arguments import single_agent
 from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.evaluation.policies import Policy, TeamPolicy
 from sme_registry.task import Task, draw
@@ -97,6 +97,7 @@ def rollouts(
     *,
     t: npt.NDArray[np.int64] | None = None,
     r_cum: Array | None = None,
+    distractors: Array | None = None,
     actions: Array | None = None,
     gamma: float = 1.0,
     seed: int = 0,
@@ -104,13 +105,13 @@ def rollouts(
     """Run an episode from each of the states `[n, S]` to its end.
 
     After `t` `[n]` steps and with `r_cum` `[n]`, by default at the start; the first actions are
-    `actions` `[n, A]`, by default the policy's. `seed` is of the distractors: episodes from equal
-    states have equal ones.
+    `actions` `[n, A]`, by default the policy's. `seed` is of distractors that are not given, and of
+    noise: episodes from equal states have equal ones. What a policy has as `bonus` `[n]` after a
+    call, such as SAC's −α log π, is added to that step of the discounted return.
     """
     if not isinstance(policy, TeamPolicy):
         task = single_agent(task)
     n, agents = len(states), len(task.policies)
-    states = initial_states(states, (n, task.spec.state_dim))
     t = np.zeros(n, np.int64) if t is None else t
     r_cum = np.zeros(n) if r_cum is None else r_cum
     totals = np.empty((6 + agents, n))
@@ -120,40 +121,43 @@ def rollouts(
         rows = order[start : start + MOST_ENVS]
         batch = Batch(task, len(rows), reuse=True)
         batch.seed_by_states(np.arange(len(rows)), states[rows], seed)
-        batch.place(states[rows], t[rows], np.repeat(r_cum[rows, None], agents, axis=1))
+        seen = None if distractors is None else distractors[rows]
+        batch.place(states[rows], t[rows], np.repeat(r_cum[rows, None], agents, axis=1), seen)
         first = None if actions is None else actions[rows]
-        totals[:, rows] = _sums(batch, _acting(policy, first), gamma)
+        totals[:, rows] = _sums(batch, _Acting(policy, first), gamma)
     returns, discounted, length = totals[:3]
     regret, similarity, square, *of_agents = totals[3:] / length
     return Rollouts(returns, discounted, length, regret, similarity, square, np.array(of_agents))
 
 
-def _sums(
-    batch: Batch, act: Callable[[Array, Observation], npt.NDArray[Any]], gamma: float
-) -> Array:
+def _sums(batch: Batch, act: _Acting, gamma: float) -> Array:
     sums, weight = np.zeros((6 + len(batch.task.policies), batch.num_envs)), 1.0
     for step in play(batch, act):
         values = step.result.values
         similarity, regret, reward = _team_means(values[[SIMILARITY, REGRET, REWARD]])
-        rows = (reward, weight * reward, 1.0, regret, similarity, similarity**2, *values[REGRET])
+        paid = weight * (reward + act.bonus)
+        rows = (reward, paid, 1.0, regret, similarity, similarity**2, *values[REGRET])
         for total, value in zip(sums, rows, strict=True):
             total += step.running * value
         weight *= gamma
     return sums
 
 
-def _acting(
-    policy: Callable[[Observation], Any], first: Array | None
-) -> Callable[[Array, Observation], npt.NDArray[Any]]:
+class _Acting:
     """A policy at the start of a batch of episodes, which takes the `first` actions, if any."""
-    begun = policy.start() if isinstance(policy, Policy | TeamPolicy) else policy
 
-    def act(state: Array, observation: Observation) -> npt.NDArray[Any]:
-        nonlocal first
-        action, first = first, None
-        return np.asarray(begun(observation.copy())) if action is None else action
+    def __init__(self, policy: Callable[[Observation], Any], first: Array | None) -> None:
+        self._policy = policy.start() if isinstance(policy, Policy | TeamPolicy) else policy
+        self._first = first
+        self.bonus: Any = 0.0
 
-    return act
+    def __call__(self, state: Array, observation: Observation) -> npt.NDArray[Any]:
+        action, self._first = self._first, None
+        if action is not None:
+            return action
+        action = np.asarray(self._policy(observation.copy()))
+        self.bonus = getattr(self._policy, "bonus", 0.0)
+        return action
 
 
 def _team_means(values: Array) -> Array:

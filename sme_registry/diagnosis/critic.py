@@ -1,0 +1,377 @@
+"""A critic against the truth: does it rank actions as the task does, and is its level right?
+
+Source: METHOD, section 11. A critic is compared with the policy that its targets assume:
+
+    PPO          V of the clipped Gaussian
+    SAC          min Q of the policy's mode, then its samples, with −α log π added at every step
+    TD3, DDPG    min Q of the actor, then the actor with its target noise
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from sme_registry.envs.arguments import single_agent
+from sme_registry.envs.batch import Batch
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation import regions
+from sme_registry.evaluation.models import evaluating, load_sb3
+from sme_registry.evaluation.policies import as_policy
+from sme_registry.evaluation.rollouts import play
+from sme_registry.evaluation.values import expected_returns, value_after_end
+from sme_registry.io import integer_in
+from sme_registry.spec import EvaluationProtocol
+from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
+from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.task import Task
+from sme_registry.task.loading import load_task
+from sme_registry.task.task import Array, Observation
+
+VISITED = "visited"
+_TRIED, _SPREAD = 16, 0.1  # actions of a state that are ranked: N(0, spread) around the policy's
+_TIMES = 10  # parts of an episode in the profile of levels
+
+
+class CriticRegion(StrictModel):
+    """A critic in some states.
+
+    Attributes:
+      region: "visited", "WD" or "OOD m".
+      states: how many.
+      ranking: share of pairs of actions, around the policy's in one state, that the critic orders
+        as the step reward does: ½ is chance, 1 perfect. Null for V.
+      misled_ranking: the same against the reward that shaping leaves to a learner of this γ; null
+        without shaping.
+      claim: mean of what the critic says.
+      finite: mean exact value to the end of the episode.
+      continuing: mean exact value of going on after it, which an agent that bootstraps at a
+        truncation estimates; null at γ = 1.
+      bias: claim minus the value that it should estimate.
+      bias_share: the bias over the mean size of that value.
+    """
+
+    region: str
+    states: Integer
+    ranking: Real | None
+    misled_ranking: Real | None
+    claim: Real
+    finite: Real
+    continuing: Real | None
+    bias: Real
+    bias_share: Real
+
+
+class CriticTime(StrictModel):
+    """Mean levels in a part of the episode, over states of the cube."""
+
+    time: Real  # mean t/T
+    claim: Real
+    finite: Real
+    continuing: Real | None
+
+
+class CriticReport(StrictModel):
+    """What a run's critic says, and the exact values (METHOD, section 11).
+
+    Attributes:
+      kind: "V" of states, "Q" of states and actions.
+      sweeps: τ times the updates: below some ten, levels are immature. Null without target networks.
+      regions: visited states, the cube, and five shells.
+      times: levels over t/T.
+    """
+
+    algorithm: str
+    kind: Literal["V", "Q"]
+    spec_digest: Digest
+    gamma: Real
+    sweeps: Real | None
+    seed: Integer
+    regions: TupleOf[CriticRegion]
+    times: TupleOf[CriticTime]
+
+    def region(self, name: str) -> CriticRegion:
+        return next(region for region in self.regions if region.region == name)
+
+
+class _Points(NamedTuple):
+    """States at any time of an episode, and what the agent sees there."""
+
+    s: Array
+    t: Any
+    r_cum: Array
+    d: Array
+    observation: Observation
+
+    @classmethod
+    def of(cls, task: Task, s: Array, t: Any, r_cum: Array, d: Array) -> _Points:
+        batch = Batch(task, len(s))
+        batch.place(s, t, r_cum[:, None], d)
+        return cls(s, t, r_cum, d, batch.observe())
+
+
+class _Critic:
+    """What an SB3 model claims, and the policy whose value that is; actions are of [0, 1]."""
+
+    def __init__(self, model: Any, seed: int) -> None:
+        import torch
+
+        self._torch, self._network = torch, model.policy
+        self._generator = torch.Generator().manual_seed(seed)
+        self.name = type(model).__name__
+        self.gamma = float(model.gamma)
+        self.sweeps: float | None = None
+        self.bonus: Any = 0.0
+        self.kind: Literal["V", "Q"] = "Q"
+        if hasattr(model.policy, "predict_values"):
+            self.kind = "V"
+            self._low, self._high = model.action_space.low, model.action_space.high
+            self._sample: Callable[[Any], Any] = self._of_gaussian
+        elif hasattr(model, "target_policy_noise"):
+            self._noise = float(model.target_policy_noise), float(model.target_noise_clip)
+            self._sample = self._of_actor
+        else:
+            entropy = getattr(model, "log_ent_coef", None)
+            constant = getattr(model, "ent_coef_tensor", 0.0)
+            self._alpha = float(constant if entropy is None else entropy.detach().exp())
+            self._sample = self._of_squashed
+        if self.kind == "Q":
+            self.sweeps = float(model.tau * model._n_updates)
+
+    def __call__(self, observations: Observation) -> Array:
+        """Actions `[B, A]` that the policy samples; `bonus` is of them."""
+        with evaluating(self._network), self._torch.no_grad():
+            return _to_unit(self._sample(self._tensor(observations)))
+
+    def mode(self, observations: Observation) -> Array | None:
+        """The deterministic actions `[B, A]`, of which Q is asked; None of V."""
+        if self.kind == "V":
+            return None
+        with evaluating(self._network), self._torch.no_grad():
+            # The squashed mean of SAC's Gaussian, the output of TD3's actor.
+            return _to_unit(self._network._predict(self._tensor(observations), deterministic=True))
+
+    def claim(self, observations: Observation, actions: Array | None) -> Array:
+        """V `[B]`, or the smallest Q `[B]` of actions."""
+        seen = self._tensor(observations)
+        with evaluating(self._network), self._torch.no_grad():
+            if actions is None:
+                return np.asarray(self._network.predict_values(seen)[:, 0], np.float64)
+            # SB3's off-policy critics take actions in [−1, 1] in every action space.
+            claims = self._network.critic(seen, self._tensor(2.0 * actions - 1.0))
+            return np.asarray(self._torch.cat(claims, dim=1).min(dim=1).values, np.float64)
+
+    def _tensor(self, array: Any) -> Any:
+        return self._torch.as_tensor(np.asarray(array, np.float32), device=self._network.device)
+
+    def _normal(self, like: Any) -> Any:
+        return self._torch.randn(like.shape, generator=self._generator)
+
+    def _of_gaussian(self, seen: Any) -> Any:
+        gaussian = self._network.get_distribution(seen).distribution
+        drawn = np.asarray(gaussian.mean + gaussian.stddev * self._normal(gaussian.mean))
+        clipped = np.clip(drawn, self._low, self._high)
+        return 2.0 * (clipped - self._low) / (self._high - self._low) - 1.0
+
+    def _of_actor(self, seen: Any) -> Any:
+        action = self._network.actor(seen)
+        spread, clip = self._noise
+        noise = (spread * self._normal(action)).clamp(-clip, clip)
+        return (action + noise).clamp(-1.0, 1.0)
+
+    def _of_squashed(self, seen: Any) -> Any:
+        mean, log_std, _ = self._network.actor.get_action_dist_params(seen)
+        noise = self._normal(mean)
+        action = self._torch.tanh(mean + log_std.exp() * noise)
+        density = -0.5 * noise**2 - log_std - 0.5 * np.log(2.0 * np.pi)
+        log_prob = (density - self._torch.log(1.0 - action**2 + 1e-6)).sum(dim=1)
+        self.bonus = -self._alpha * np.asarray(log_prob, np.float64)
+        return action
+
+
+def critic(
+    model: Any,
+    task: SpecLike | Task,
+    *,
+    kind: Literal["V", "Q"] | None = None,
+    states: int = 1000,
+    seed: int = 0,
+) -> CriticReport:
+    """Compare the critic of a Stable-Baselines3 model with the exact values of its policy.
+
+    Args:
+      model: PPO, TD3, SAC or DDPG, as a model or the path of its .zip (which can run code of its
+        author), as `sme train` writes it for agents in JAX too.
+      kind: "V" or "Q", to be sure of it; by default what the model has.
+      states: of each region.
+      seed: of states, of noise and of sampled actions.
+
+    Example:
+      >>> report = critic("runs/ppo/model.zip", "Default", states=100)
+      >>> report.kind
+      'V'
+    """
+    task = single_agent(task if isinstance(task, Task) else load_task(task))
+    integer_in("states", states, 1)
+    learnt = _critic_of(model, task, kind, seed)
+    tail = None
+    if learnt.gamma < 1:
+        tail = value_after_end(task, learnt, learnt.gamma, seed)
+    protocol = EvaluationProtocol(states_per_region=states, seed=seed)
+    points = {VISITED: _visited(task, learnt, states, seed)} | {
+        regions.region_name(region): _drawn(task, protocol, region)
+        for region in range(len(protocol.epsilons) + 1)
+    }
+    levels = {name: _Levels.of(task, learnt, at, tail, seed) for name, at in points.items()}
+    return CriticReport(
+        algorithm=learnt.name,
+        kind=learnt.kind,
+        spec_digest=task.spec.digest,
+        gamma=learnt.gamma,
+        sweeps=learnt.sweeps,
+        seed=seed,
+        regions=tuple(
+            _region(task, learnt, name, at, levels[name], seed) for name, at in points.items()
+        ),
+        times=tuple(_times(task, points["WD"], levels["WD"])),
+    )
+
+
+def _critic_of(model: Any, task: Task, kind: str | None, seed: int) -> _Critic:
+    learnt = load_sb3(model) if isinstance(model, str | Path) else model
+    policy = getattr(learnt, "policy", None)
+    if not hasattr(policy, "predict_values") and not hasattr(policy, "critic"):
+        raise PolicyError(
+            f"model: {type(learnt).__name__} has no critic that is known here. Give a PPO, A2C, TD3, "
+            "SAC or DDPG of Stable-Baselines3, or its .zip."
+        )
+    seen, expected = learnt.observation_space.shape, (task.spec.observation_dim,)
+    if seen != expected:
+        raise PolicyError(
+            f"model: its observations have shape {seen}, and this task's {expected}. Give the task "
+            "that it was trained on; of a stream with an observed phase, critics are not compared."
+        )
+    found = _Critic(learnt, seed)
+    if kind not in (None, found.kind):
+        raise PolicyError(
+            f"kind={kind!r}: {found.name} has a critic of {found.kind}, not of {kind}. Leave kind out."
+        )
+    return found
+
+
+def _to_unit(symmetric: Any) -> Array:
+    return np.asarray((np.asarray(symmetric, np.float64) + 1.0) / 2.0)
+
+
+def _drawn(task: Task, protocol: EvaluationProtocol, region: int) -> _Points:
+    """States of a region at uniform times, with nothing accumulated."""
+    (batch,) = regions.states(protocol, region, task.spec, protocol.states_per_region)
+    t = np.floor(batch.time * task.spec.horizon).astype(np.int64)
+    return _Points.of(task, np.asarray(batch.s, np.float64), t, np.zeros(len(t)), batch.d)
+
+
+def _visited(task: Task, learnt: _Critic, states: int, seed: int) -> _Points:
+    """States that the policy visits, at random times of its episodes."""
+    spec = task.spec
+    batch = Batch(task, max(16, -(-2 * states // spec.horizon)))
+    for env in range(batch.num_envs):
+        batch.seed(env, seed + env)
+    batch.begin(np.arange(batch.num_envs), batch.observe())
+    rows: list[tuple[Array, ...]] = []
+    for t, step in enumerate(play(batch, lambda _, seen: learnt(seen))):
+        waiting = step.observation[:, spec.state_dim + spec.distractors + 1] * float(spec.k)
+        time = np.full(len(waiting), t)
+        parts = step.state, time, waiting.astype(np.float64), step.distractors
+        rows.append(tuple(part[step.running] for part in parts))
+    s, t, r_cum, d = (np.concatenate(column) for column in zip(*rows, strict=True))
+    chosen = np.random.default_rng(seed).permutation(len(s))[:states]
+    return _Points.of(task, s[chosen], t[chosen], r_cum[chosen], d[chosen])
+
+
+class _Levels(NamedTuple):
+    """What the critic says of points, and exact values, `[N]`."""
+
+    claim: Array
+    finite: Array
+    continuing: Array | None
+
+    @property
+    def estimated(self) -> Array:
+        return self.finite if self.continuing is None else self.continuing
+
+    @classmethod
+    def of(
+        cls, task: Task, learnt: _Critic, at: _Points, tail: float | None, seed: int
+    ) -> _Levels:
+        mode = learnt.mode(at.observation)
+        begun = {"t": at.t, "r_cum": at.r_cum, "distractors": at.d, "actions": mode}
+        learnt.bonus = 0.0
+        returns = expected_returns(task, learnt, at.s, gamma=learnt.gamma, seed=seed, **begun)
+        continuing = None if tail is None else returns.finite + returns.left * tail
+        return cls(learnt.claim(at.observation, mode), returns.finite, continuing)
+
+
+def _region(
+    task: Task, learnt: _Critic, name: str, at: _Points, levels: _Levels, seed: int
+) -> CriticRegion:
+    bias = float((levels.claim - levels.estimated).mean())
+    ranking, misled = _rankings(task, learnt, at, seed) if learnt.kind == "Q" else (None, None)
+    return CriticRegion(
+        region=name,
+        states=len(at.s),
+        ranking=ranking,
+        misled_ranking=misled,
+        claim=float(levels.claim.mean()),
+        finite=float(levels.finite.mean()),
+        continuing=None if levels.continuing is None else float(levels.continuing.mean()),
+        bias=bias,
+        bias_share=bias / max(abs(float(levels.estimated.mean())), 1e-9),
+    )
+
+
+def _times(task: Task, at: _Points, levels: _Levels) -> list[CriticTime]:
+    part = at.t * _TIMES // task.spec.horizon
+    rows = []
+    for rows_of in (np.flatnonzero(part == i) for i in range(_TIMES)):
+        if rows_of.size:
+            means = [None if x is None else float(x[rows_of].mean()) for x in levels]
+            rows.append(
+                CriticTime(
+                    time=float(at.t[rows_of].mean() / task.spec.horizon),
+                    **dict(zip(("claim", "finite", "continuing"), means, strict=True)),
+                )
+            )
+    return rows
+
+
+def _rankings(
+    task: Task, learnt: _Critic, at: _Points, seed: int
+) -> tuple[float, float | None]:
+    """Shares of pairs that the critic orders as the step reward, and as what misleads it."""
+    spec, gamma = task.spec, learnt.gamma
+    mode = learnt.mode(at.observation)
+    assert mode is not None
+    noise = np.random.default_rng(seed).normal(0.0, _SPREAD, (_TRIED, *mode.shape))
+    actions = np.clip(mode + noise, 0.0, 1.0)  # [tried, N, A]
+    claims = np.array([learnt.claim(at.observation, a) for a in actions])
+    rewards = np.array([task.step_reward(at.s, a) for a in actions])
+    dead = rewards < spec.D
+    ranking = _share_in_order(claims, rewards, dead)
+    if spec.shaping is None:
+        return ranking, None
+    later = np.array([task.potential(task.transition(at.s, a), at.t + 1) for a in actions])
+    payout = np.minimum(spec.k - 1 - at.t % spec.k, spec.horizon - 1 - at.t)
+    misleading = (spec.shaping.discount - gamma) * np.where(dead, 0.0, later)
+    return ranking, _share_in_order(claims, gamma**payout * rewards + misleading, dead)
+
+
+def _share_in_order(claims: Array, truth: Array, dead: Array) -> float:
+    """Of pairs of actions that differ, and of which one lives on, the share ordered alike."""
+    first, second = np.triu_indices(len(claims), 1)
+    difference = truth[first] - truth[second]
+    counted = (difference != 0) & ~(dead[first] & dead[second])
+    alike = np.sign(claims[first] - claims[second]) == np.sign(difference)
+    return float(alike[counted].mean()) if counted.any() else float("nan")

@@ -1,0 +1,190 @@
+"""Exact values of a policy, from roll-outs of the known task (METHOD, section 11)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.envs.arguments import initial_states, single_agent
+from sme_registry.errors import OptionError, StateError
+from sme_registry.evaluation.policies import Policy, as_policy
+from sme_registry.evaluation.rollouts import Rollouts, rollouts
+from sme_registry.io import choice, integer_in
+from sme_registry.spec import SMESpec
+from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.task import Task, draw
+from sme_registry.task.loading import load_task
+from sme_registry.task.task import Array, Observation
+
+Horizon = Literal["finite", "continuing"]
+_TAILS = 64  # roll-outs from the end of an episode on
+_NEGLIGIBLE = 0.01  # weight of the first reward that a tail leaves out
+
+
+def values(
+    task: SpecLike | Task,
+    policy: Any,
+    states: npt.ArrayLike,
+    *,
+    gamma: float,
+    t: npt.ArrayLike = 0,
+    accumulated: npt.ArrayLike = 0.0,
+    distractors: npt.ArrayLike | None = None,
+    actions: npt.ArrayLike | None = None,
+    horizon: Horizon = "finite",
+    samples: int = 1,
+    seed: int = 0,
+) -> Array:
+    """The exact value `[B]` of a policy at each of some states: what a critic should say.
+
+    The discounted rewards that the agent is paid, shaping and noise included, to the end of the
+    episode. METHOD, section 11. For a stream give the task of a phase, such as `phase.spec`.
+
+    Args:
+      policy: as in `evaluate`; one that samples its actions is averaged over `samples`.
+      states: `[B, S]`, also outside the cube.
+      gamma: discount in [0, 1].
+      t: steps before each state, `[B]` or one number, in [0, T).
+      accumulated: r_cum before each state, `[B]` or one number, in [0, k).
+      distractors: `[B, m]`, by default drawn from `seed`.
+      actions: first actions `[B, A]` of the unit range, for a value of actions (Q); by default
+        the policy's.
+      horizon: "continuing" adds γ^(T − t) times the mean value of going on after the end without
+        shaping, with t/T held at 1: what an agent that bootstraps at a truncation estimates.
+      samples: roll-outs from each state, which a stochastic policy or noise needs.
+      seed: of distractors, noise and the states that a continuing value goes on from.
+
+    Example:
+      >>> sme_registry.values("SME/Default-v1", "optimal", np.full((2, 8), 0.5), gamma=1.0, t=[0, 90])
+      array([100.,  10.])
+    """
+    task = single_agent(task if isinstance(task, Task) else load_task(task))
+    spec = task.spec
+    choice("horizon", horizon, ("finite", "continuing"))
+    integer_in("samples", samples, 1)
+    _check_gamma(gamma, horizon)
+    s = _states(states, spec.state_dim)
+    B = len(s)
+    steps = _each("t", t, B, 0, spec.horizon - 1).astype(np.int64)
+    r_cum = _each("accumulated", accumulated, B, 0.0, spec.k)
+    d = _rows("distractors", distractors, (B, spec.distractors))
+    first = _rows("actions", actions, (B, spec.action_dim))
+    if policy == "optimal" and first is None and horizon == "finite" and _has_formula(spec, gamma):
+        return _of_optimum(task, s, steps, gamma)
+    begun = {"t": steps, "r_cum": r_cum, "distractors": d, "actions": first}
+    acting = as_policy(policy, spec)
+    returns = expected_returns(task, acting, s, gamma=gamma, samples=samples, seed=seed, **begun)
+    if horizon == "finite":
+        return returns.finite
+    return returns.finite + returns.left * value_after_end(task, acting, gamma, seed)
+
+
+class Returns(NamedTuple):
+    """Mean returns `[B]` to the end of the episode, and the discount there."""
+
+    finite: Array
+    left: Array  # γ^(T − t), 0 of episodes that D ends before
+
+    @classmethod
+    def of(cls, rollouts: Rollouts, steps: npt.NDArray[np.int64], gamma: float) -> Returns:
+        """Those of episodes that had so many `steps` to go."""
+        ended = rollouts.length < steps
+        return cls(rollouts.discounted_return, np.where(ended, 0.0, gamma**steps))
+
+
+def expected_returns(
+    task: Task,
+    policy: Callable[[Observation], Any],
+    s: Array,
+    *,
+    t: npt.NDArray[np.int64],
+    gamma: float,
+    samples: int = 1,
+    seed: int = 0,
+    **begun: Array | None,
+) -> Returns:
+    """`values` of checked arguments; `begun` are r_cum, distractors and first actions."""
+    runs = (
+        Returns.of(
+            rollouts(policy, task, s, t=t, gamma=gamma, seed=seed + i, **begun),
+            task.spec.horizon - t,
+            gamma,
+        )
+        for i in range(samples)
+    )
+    return Returns(*(np.mean(parts, axis=0) for parts in zip(*runs, strict=True)))
+
+
+def _has_formula(spec: SMESpec, gamma: float) -> bool:
+    return spec.k == 1 and spec.D < 1 
+
+
+def _of_optimum(task: Task, s: Array, t: npt.NDArray[np.int64], gamma: float) -> Array:
+    left = task.spec.horizon - t
+    if gamma == 1:
+        return np.asarray(left, np.float64)
+    return np.asarray((1 - gamma**left) / (1 - gamma))
+
+
+def value_after_end(
+    task: Task, policy: Callable[[Observation], Any], gamma: float, seed: int
+) -> float:
+    """V̄_T: the mean value of going on for ever from uniform states, with t/T held at 1."""
+    steps = 1 if gamma == 0 else max(1, int(np.ceil(np.log(_NEGLIGIBLE) / np.log(gamma))))
+    # Neither changes what is drawn, only how long an episode is, and that P = 0.
+    spec = task.spec.derive(horizon=steps)
+    s = draw.uniform(seed, "values/tail", _TAILS * spec.state_dim).reshape(_TAILS, -1)
+    at_end = _AtEnd(policy, spec.state_dim + spec.distractors)
+    tail = rollouts(at_end, load_task(spec), s, gamma=gamma, seed=seed)
+    return float(tail.discounted_return.mean() / (1 - gamma**steps))
+
+
+class _AtEnd:
+    """A policy that always sees t/T = 1."""
+
+    def __init__(self, policy: Callable[[Observation], Any], of_t: int) -> None:
+        self._policy = policy.start() if isinstance(policy, Policy) else policy
+        self._of_t = of_t
+
+    def __call__(self, observations: Observation) -> Any:
+        observations[:, self._of_t] = 1.0
+        return self._policy(observations)
+
+    @property
+    def bonus(self) -> Any:
+        return getattr(self._policy, "bonus", 0.0)
+
+
+def _check_gamma(gamma: float, horizon: Horizon) -> None:
+    if not 0 <= gamma <= 1:
+        raise OptionError(f"gamma={gamma!r}: must be a discount in [0, 1].")
+    if gamma == 1 and horizon == "continuing":
+        raise OptionError(
+            'horizon="continuing": without an end and with gamma=1, values are infinite. Use '
+            'horizon="finite", or gamma below 1.'
+        )
+
+
+def _each(name: str, given: npt.ArrayLike, B: int, low: float, high: float) -> Array:
+    """A number for each state, from one or from `[B]`."""
+    numbers = np.asarray(given, np.float64)
+    if numbers.shape not in ((), (B,)) or not ((low <= numbers) & (numbers <= high)).all():
+        raise OptionError(
+            f"{name}={given!r:.80}: must be one number or {B}, one for each state, in "
+            f"[{low:g}, {high:g}]."
+        )
+    return np.broadcast_to(numbers, (B,)).copy()
+
+
+def _rows(name: str, given: npt.ArrayLike | None, shape: tuple[int, int]) -> Array | None:
+    return None if given is None else initial_states(given, shape, name)
+
+
+def _states(states: npt.ArrayLike, state_dim: int) -> Array:
+    s = np.asarray(states, np.float64)
+    if s.ndim != 2 or s.shape[1] != state_dim or not np.isfinite(s).all():
+        raise StateError(f"states of shape {s.shape}: must be finite, of shape [B, {state_dim}].")
+    return s

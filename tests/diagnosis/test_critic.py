@@ -1,0 +1,122 @@
+"""Critics against exact values: whose value, which order of actions, and models without one."""
+
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.errors import SMEError
+from sme_registry.spec import SMESpec
+
+pytest.importorskip("stable_baselines3")
+
+import torch
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+
+from sme_registry.diagnosis import critic
+
+SMALL = {"horizon": 20, "state_dim": 3, "action_dim": 2}
+
+
+def model(algorithm, gamma=0.9, action_range="unit", spec=None, **options):
+    """An untrained model: what it is compared with does not depend on what it has learnt."""
+    options |= {"buffer_size": 10} if algorithm is not PPO else {}
+    env = sme_registry.make(spec or SMESpec(**SMALL), action_range=action_range)
+    return algorithm("MlpPolicy", env, seed=0, gamma=gamma, **options)
+
+
+class Judge(torch.nn.Module):
+    """A critic that says what a function of s, t and actions in [0, 1] says."""
+
+    def __init__(self, says):
+        super().__init__()
+        self.says = says
+
+    def forward(self, seen, actions):
+        seen, unit = seen.numpy().astype(float), (actions.numpy().astype(float) + 1) / 2
+        return (torch.tensor(self.says(seen[:, :3], seen[:, 3], unit))[:, None],)
+
+
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+@pytest.mark.parametrize("algorithm", [TD3, DDPG])
+def test_the_value_of_an_actor_is_that_of_its_deterministic_first_action(algorithm, action_range):
+    report = critic(model(algorithm, gamma=0.0, action_range=action_range), SMESpec(**SMALL))
+    assert report.kind == "Q"
+    assert [region.region for region in report.regions] == ["visited", "WD"] + [
+        f"OOD {m}" for m in range(1, 6)
+    ]
+    cube = report.region("WD")
+    assert cube.continuing == pytest.approx(cube.finite)  # nothing follows at γ = 0
+    assert cube.bias == pytest.approx(cube.claim - cube.finite)
+
+
+def test_of_td3_the_target_noise_belongs_to_the_value_and_of_sac_the_entropy():
+    still, noisy = (
+        critic(model(TD3, target_policy_noise=spread), SMESpec(**SMALL), states=500).region("WD")
+        for spread in (0.0, 2.0)
+    )
+    assert still.claim == noisy.claim
+    assert abs(still.finite - noisy.finite) > 0.02
+    plain, with_entropy, at_once = (
+        critic(model(SAC, ent_coef=alpha, gamma=gamma), SMESpec(**SMALL)).region("WD")
+        for alpha, gamma in ((0.0, 0.9), (1.0, 0.9), (1.0, 0.0))
+    )
+    assert with_entropy.finite - plain.finite > 1.0  # an untrained Gaussian has entropy
+    assert at_once.finite < 1.0  # none of it belongs to the first action
+
+
+def test_a_state_value_is_of_the_clipped_gaussian_and_needs_no_sweeps():
+    policy = model(PPO, gamma=0.0)
+    report = critic(policy, SMESpec(**SMALL), states=2000)
+    assert (report.kind, report.sweeps, report.region("WD").ranking) == ("V", None, None)
+    task = sme_registry.materialize(SMESpec(**SMALL))
+    s = np.random.default_rng(0).uniform(size=(2000, 3))
+    seen = np.column_stack([s, np.full(2000, 0.5), np.zeros(2000)]).astype(np.float32)
+    actions, _ = policy.predict(seen, deterministic=False)
+    expected = task.step_reward(s, actions).mean()
+    assert report.region("WD").finite == pytest.approx(expected, abs=0.03)
+
+
+def test_a_critic_that_knows_the_reward_ranks_perfectly_and_its_opposite_never():
+    task, judged = sme_registry.materialize(SMESpec(**SMALL)), model(TD3)
+    for sign, share in ((1, 1), (-1, 0)):
+        judged.policy.critic = Judge(lambda s, t, a, sign=sign: sign * task.step_reward(s, a))
+        ranking = critic(judged, task.spec, states=50).region("WD").ranking
+        assert ranking == pytest.approx(share, abs=0.01)
+
+
+def test_a_critic_that_shaping_misleads_is_told_from_one_that_has_not_learnt():
+    spec = SMESpec(**SMALL, shaping={"scale": 30})
+    task, judged = sme_registry.materialize(spec), model(TD3, gamma=0.5, spec=spec)
+
+    def misled(s, t, a):
+        later = task.potential(task.transition(s, a), t * spec.horizon + 1)
+        return task.step_reward(s, a) + 0.5 * later
+
+    judged.policy.critic = Judge(misled)
+    cube = critic(judged, spec, states=50).region("WD")
+    assert cube.misled_ranking > 0.99
+    assert cube.ranking < 0.7
+
+
+def test_levels_over_time_fall_towards_the_end_of_an_episode_and_continuing_ones_do_not():
+    report = critic(model(TD3), SMESpec(**SMALL), states=1000)
+    first, last = report.times[0], report.times[-1]
+    assert len(report.times) == 10
+    assert last.finite < 0.5 * first.finite
+    assert last.continuing > 0.8 * first.continuing
+    assert critic(model(TD3, gamma=1.0), SMESpec(**SMALL), states=20).times[0].continuing is None
+
+
+@pytest.mark.parametrize(
+    ("judged", "arguments", "says"),
+    [
+        (lambda: model(PPO), {"kind": "Q"}, "critic of V, not of Q"),
+        (lambda: model(PPO), {"task": "Default"}, "trained on"),
+        (lambda: model(PPO), {"task": "Team2"}, "agents"),
+        (lambda: model(PPO), {"states": 0}, "states=0"),
+        (lambda: object(), {}, "no critic"),
+    ],
+)
+def test_a_model_without_that_critic_is_refused(judged, arguments, says):
+    with pytest.raises(SMEError, match=says):
+        critic(judged(), **{"task": SMESpec(**SMALL)} | arguments)
