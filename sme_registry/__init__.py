@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from sme_registry.datasets import make_dataset, train_offline
     from sme_registry.diagnosis import diagnose
     from sme_registry.evaluation import EvaluationReport, StreamReport, evaluate
-    from sme_registry.export import export_onnx
     from sme_registry.evaluation.values import values
+    from sme_registry.export import export_onnx
     from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
     from sme_registry.studies import compare, run_study
     from sme_registry.studies import load as load_study

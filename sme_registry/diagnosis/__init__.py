@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from sme_registry.diagnosis.critics import critic
 from sme_registry.diagnosis.document import Diagnosis
 from sme_registry.diagnosis.stream import diagnose_stream
 from sme_registry.diagnosis.subject import (
@@ -22,6 +23,7 @@ __all__ = [
     "Diagnosis",
     "StreamSubject",
     "Subject",
+    "critic",
     "diagnose",
     "load_policy",
     "load_run",

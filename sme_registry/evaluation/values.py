@@ -58,7 +58,8 @@ def values(
       seed: of distractors, noise and the states that a continuing value goes on from.
 
     Example:
-      >>> sme_registry.values("SME/Default-v1", "optimal", np.full((2, 8), 0.5), gamma=1.0, t=[0, 90])
+      >>> states = np.full((2, 8), 0.5)
+      >>> sme_registry.values("Default", "optimal", states, gamma=1.0, t=[0, 90])
       array([100.,  10.])
     """
     task = single_agent(task if isinstance(task, Task) else load_task(task))
@@ -119,13 +120,14 @@ def expected_returns(
 
 
 def _has_formula(spec: SMESpec, gamma: float) -> bool:
-    return spec.k == 1 and spec.D < 1 
+    telescopes = spec.shaping is None or gamma == spec.shaping.discount == 1
+    return spec.k == 1 and spec.D < 1 and not spec.compensated and telescopes
 
 
 def _of_optimum(task: Task, s: Array, t: npt.NDArray[np.int64], gamma: float) -> Array:
     left = task.spec.horizon - t
     if gamma == 1:
-        return np.asarray(left, np.float64)
+        return np.asarray(left - task.potential(s, t))
     return np.asarray((1 - gamma**left) / (1 - gamma))
 
 
@@ -135,7 +137,7 @@ def value_after_end(
     """V̄_T: the mean value of going on for ever from uniform states, with t/T held at 1."""
     steps = 1 if gamma == 0 else max(1, int(np.ceil(np.log(_NEGLIGIBLE) / np.log(gamma))))
     # Neither changes what is drawn, only how long an episode is, and that P = 0.
-    spec = task.spec.derive(horizon=steps)
+    spec = task.spec.derive(horizon=steps, shaping=None)
     s = draw.uniform(seed, "values/tail", _TAILS * spec.state_dim).reshape(_TAILS, -1)
     at_end = _AtEnd(policy, spec.state_dim + spec.distractors)
     tail = rollouts(at_end, load_task(spec), s, gamma=gamma, seed=seed)

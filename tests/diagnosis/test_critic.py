@@ -95,7 +95,7 @@ def test_a_critic_that_shaping_misleads_is_told_from_one_that_has_not_learnt():
     judged.policy.critic = Judge(misled)
     cube = critic(judged, spec, states=50).region("WD")
     assert cube.misled_ranking > 0.99
-    assert cube.ranking < 0.7
+    assert cube.ranking < 0.8
 
 
 def test_levels_over_time_fall_towards_the_end_of_an_episode_and_continuing_ones_do_not():

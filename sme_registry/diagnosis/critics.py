@@ -20,7 +20,6 @@ from sme_registry.envs.batch import Batch
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.models import evaluating, load_sb3
-from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.rollouts import play
 from sme_registry.evaluation.values import expected_returns, value_after_end
 from sme_registry.io import integer_in
@@ -79,7 +78,7 @@ class CriticReport(StrictModel):
 
     Attributes:
       kind: "V" of states, "Q" of states and actions.
-      sweeps: τ times the updates: below some ten, levels are immature. Null without target networks.
+      sweeps: τ times the updates; below some ten, levels are immature. Null of V.
       regions: visited states, the cube, and five shells.
       times: levels over t/T.
     """
@@ -245,8 +244,8 @@ def _critic_of(model: Any, task: Task, kind: str | None, seed: int) -> _Critic:
     policy = getattr(learnt, "policy", None)
     if not hasattr(policy, "predict_values") and not hasattr(policy, "critic"):
         raise PolicyError(
-            f"model: {type(learnt).__name__} has no critic that is known here. Give a PPO, A2C, TD3, "
-            "SAC or DDPG of Stable-Baselines3, or its .zip."
+            f"model: {type(learnt).__name__} has no critic that is known here. Give a PPO, A2C, "
+            "TD3, SAC or DDPG of Stable-Baselines3, or its .zip."
         )
     seen, expected = learnt.observation_space.shape, (task.spec.observation_dim,)
     if seen != expected:
@@ -257,7 +256,8 @@ def _critic_of(model: Any, task: Task, kind: str | None, seed: int) -> _Critic:
     found = _Critic(learnt, seed)
     if kind not in (None, found.kind):
         raise PolicyError(
-            f"kind={kind!r}: {found.name} has a critic of {found.kind}, not of {kind}. Leave kind out."
+            f"kind={kind!r}: {found.name} has a critic of {found.kind}, not of {kind}. Leave kind "
+            "out."
         )
     return found
 
@@ -303,9 +303,7 @@ class _Levels(NamedTuple):
         return self.finite if self.continuing is None else self.continuing
 
     @classmethod
-    def of(
-        cls, task: Task, learnt: _Critic, at: _Points, tail: float | None, seed: int
-    ) -> _Levels:
+    def of(cls, task: Task, learnt: _Critic, at: _Points, tail: float | None, seed: int) -> _Levels:
         mode = learnt.mode(at.observation)
         begun = {"t": at.t, "r_cum": at.r_cum, "distractors": at.d, "actions": mode}
         learnt.bonus = 0.0
@@ -347,9 +345,7 @@ def _times(task: Task, at: _Points, levels: _Levels) -> list[CriticTime]:
     return rows
 
 
-def _rankings(
-    task: Task, learnt: _Critic, at: _Points, seed: int
-) -> tuple[float, float | None]:
+def _rankings(task: Task, learnt: _Critic, at: _Points, seed: int) -> tuple[float, float | None]:
     """Shares of pairs that the critic orders as the step reward, and as what misleads it."""
     spec, gamma = task.spec, learnt.gamma
     mode = learnt.mode(at.observation)
