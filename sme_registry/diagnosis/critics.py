@@ -28,7 +28,7 @@ from sme_registry.spec.document import Digest, Integer, Real, StrictModel, Tuple
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import Task
 from sme_registry.task.loading import load_task
-from sme_registry.task.task import Array, Observation
+from sme_registry.task.task import Array, Mask, Observation
 
 VISITED = "visited"
 _TRIED, _SPREAD = 16, 0.1  # actions of a state that are ranked: N(0, spread) around the policy's
@@ -78,7 +78,7 @@ class CriticReport(StrictModel):
 
     Attributes:
       kind: "V" of states, "Q" of states and actions.
-      sweeps: τ times the updates; below some ten, levels are immature. Null of V.
+      sweeps: τ times the updates of the targets. Null of V.
       regions: visited states, the cube, and five shells.
       times: levels over t/T.
     """
@@ -138,7 +138,8 @@ class _Critic:
             self._alpha = float(constant if entropy is None else entropy.detach().exp())
             self._sample = self._of_squashed
         if self.kind == "Q":
-            self.sweeps = float(model.tau * model._n_updates)
+            every = getattr(model, "policy_delay", getattr(model, "target_update_interval", 1))
+            self.sweeps = float(model.tau * model._n_updates / every)
 
     def __call__(self, observations: Observation) -> Array:
         """Actions `[B, A]` that the policy samples; `bonus` is of them."""
@@ -196,7 +197,7 @@ def critic(
     task: SpecLike | Task,
     *,
     kind: Literal["V", "Q"] | None = None,
-    states: int = 1000,
+    states: int = 500,
     seed: int = 0,
 ) -> CriticReport:
     """Compare the critic of a Stable-Baselines3 model with the exact values of its policy.
@@ -239,10 +240,22 @@ def critic(
     )
 
 
+def has_critic(model: Any, task: Task) -> bool:
+    """Whether `critic` can compare the critic of a model on this task."""
+    return _is_read(model) and model.observation_space.shape == (task.spec.observation_dim,)
+
+
+def _is_read(model: Any) -> bool:
+    """Whether a model is one whose critic, and the policy that it is of, are known here."""
+    module = type(model).__module__
+    if not module.startswith("stable_baselines3."):
+        return False
+    return any(hasattr(model.policy, critic) for critic in ("predict_values", "critic"))
+
+
 def _critic_of(model: Any, task: Task, kind: str | None, seed: int) -> _Critic:
     learnt = load_sb3(model) if isinstance(model, str | Path) else model
-    policy = getattr(learnt, "policy", None)
-    if not hasattr(policy, "predict_values") and not hasattr(policy, "critic"):
+    if not _is_read(learnt):
         raise PolicyError(
             f"model: {type(learnt).__name__} has no critic that is known here. Give a PPO, A2C, "
             "TD3, SAC or DDPG of Stable-Baselines3, or its .zip."
@@ -281,9 +294,9 @@ def _visited(task: Task, learnt: _Critic, states: int, seed: int) -> _Points:
         batch.seed(env, seed + env)
     batch.begin(np.arange(batch.num_envs), batch.observe())
     rows: list[tuple[Array, ...]] = []
-    for t, step in enumerate(play(batch, lambda _, seen: learnt(seen))):
+    for steps, step in enumerate(play(batch, lambda _, seen: learnt(seen))):
         waiting = step.observation[:, spec.state_dim + spec.distractors + 1] * float(spec.k)
-        time = np.full(len(waiting), t)
+        time = np.full(len(waiting), steps)
         parts = step.state, time, waiting.astype(np.float64), step.distractors
         rows.append(tuple(part[step.running] for part in parts))
     s, t, r_cum, d = (np.concatenate(column) for column in zip(*rows, strict=True))
@@ -305,9 +318,11 @@ class _Levels(NamedTuple):
     @classmethod
     def of(cls, task: Task, learnt: _Critic, at: _Points, tail: float | None, seed: int) -> _Levels:
         mode = learnt.mode(at.observation)
-        begun = {"t": at.t, "r_cum": at.r_cum, "distractors": at.d, "actions": mode}
         learnt.bonus = 0.0
-        returns = expected_returns(task, learnt, at.s, gamma=learnt.gamma, seed=seed, **begun)
+        returns = expected_returns(
+            task, learnt, at.s, t=at.t, gamma=learnt.gamma, seed=seed,
+            r_cum=at.r_cum, distractors=at.d, actions=mode,
+        )  # fmt: skip
         continuing = None if tail is None else returns.finite + returns.left * tail
         return cls(learnt.claim(at.observation, mode), returns.finite, continuing)
 
@@ -333,15 +348,15 @@ def _region(
 def _times(task: Task, at: _Points, levels: _Levels) -> list[CriticTime]:
     part = at.t * _TIMES // task.spec.horizon
     rows = []
-    for rows_of in (np.flatnonzero(part == i) for i in range(_TIMES)):
-        if rows_of.size:
-            means = [None if x is None else float(x[rows_of].mean()) for x in levels]
-            rows.append(
-                CriticTime(
-                    time=float(at.t[rows_of].mean() / task.spec.horizon),
-                    **dict(zip(("claim", "finite", "continuing"), means, strict=True)),
-                )
+    for chosen in (np.flatnonzero(part == i) for i in range(_TIMES)):
+        if chosen.size:
+            claim, finite, continuing = (
+                None if level is None else float(level[chosen].mean()) for level in levels
             )
+            assert claim is not None
+            assert finite is not None
+            time = float(at.t[chosen].mean() / task.spec.horizon)
+            rows.append(CriticTime(time=time, claim=claim, finite=finite, continuing=continuing))
     return rows
 
 
@@ -364,7 +379,7 @@ def _rankings(task: Task, learnt: _Critic, at: _Points, seed: int) -> tuple[floa
     return ranking, _share_in_order(claims, gamma**payout * rewards + misleading, dead)
 
 
-def _share_in_order(claims: Array, truth: Array, dead: Array) -> float:
+def _share_in_order(claims: Array, truth: Array, dead: Mask) -> float:
     """Of pairs of actions that differ, and of which one lives on, the share ordered alike."""
     first, second = np.triu_indices(len(claims), 1)
     difference = truth[first] - truth[second]

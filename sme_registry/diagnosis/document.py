@@ -21,6 +21,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from sme_registry.diagnosis.behaviour import CapacityProbe, OnPolicy, TrainingSummary
+from sme_registry.diagnosis.critics import CriticReport
 from sme_registry.diagnosis.measure import (
     LINEAR,
     POLICY,
@@ -327,7 +328,7 @@ class Measurements(StrictModel):
     `distraction` of one with distractors; the JSON of other tasks does not have these fields.
     """
 
-    fields_added_later = ("limits", "observation", "distraction")
+    fields_added_later = ("limits", "observation", "distraction", "critic")
 
     uniform: dict[str, Score]  # the policy and each reference in the same uniform states
     channels: TupleOf[Channel]  # by action channel
@@ -346,6 +347,7 @@ class Measurements(StrictModel):
     limits: Violations | None = None  # of a task with `safety`
     observation: ObservationReport | None = None  # of the policy's evaluation
     distraction: DistractorRegret | None = None  # of a task with distractors
+    critic: CriticReport | None = None  # of a model whose critic can be read
 
     @property
     def policy(self) -> Score:

@@ -251,6 +251,35 @@ def _which_phases(diagnosis: StreamDiagnosis, figure: Figure) -> None:
         legend_above(axes)
 
 
+def _critic(diagnosis: TaskDiagnosis, figure: Figure) -> None:
+    """Nothing without a critic; only its level where it values states."""
+    report = diagnosis.measurements.critic
+    if report is None:
+        return
+    ranked = [region for region in report.regions if region.ranking is not None]
+    *left, right = figure.subplots(1, 2 if ranked else 1, squeeze=False)[0]
+    for axes in left:
+        series = {"as their step rewards": [region.ranking for region in ranked]}
+        if ranked[0].misled_ranking is not None:
+            name = f"as paid at γ = {report.gamma:g}"
+            series[name] = [region.misled_ranking for region in ranked]
+        _lines(axes, range(len(ranked)), series)
+        axes.axhline(0.5, color=GREY, linewidth=1.1, label="chance")
+        axes.set_xticks(range(len(ranked)), [region.region for region in ranked], rotation=45)
+        axes.set(ylabel="pairs of actions that the critic\norders so, share", ylim=(0.0, 1.0))
+    levels = {"the critic says": "claim", "to the end of the episode": "finite"}
+    if report.regions[0].continuing is not None:
+        levels["if it went on"] = "continuing"
+    time = [part.time for part in report.times]
+    _lines(
+        right,
+        time,
+        {name: [getattr(part, of) for part in report.times] for name, of in levels.items()},
+    )
+    right.set(xlabel="t/T", ylabel="discounted value")
+    _legends(*left, right)
+
+
 def _draw_fresh(axes: Axes, values: Sequence[float | None]) -> None:
     """A stroke across each place, of its fresh agent, where all of them are known."""
     x = np.arange(len(values))
@@ -291,6 +320,7 @@ _FIGURES: dict[type[Diagnosis], dict[str, Callable[[Any, Figure], None]]] = {
         "where_states": _states,
         "where_time": _time,
         "what_the_error_is": _squared_error,
+        "what_the_critic_knows": _critic,
     },
     TeamDiagnosis: {"who_agents": _agents},
     StreamDiagnosis: {"which_phases": _which_phases, "network_by_visit": _network_by_visit},

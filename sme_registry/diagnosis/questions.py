@@ -65,6 +65,12 @@ THRESHOLDS = {
     "kept_r2": 0.5,  # held-out R² of a linear map of a layer, at least
     "owed_to_distractors": 0.05,  # normalised regret, at least
     "invariant": 0.01,  # change of actions by other distractors over mean |½ − a*|, at most
+    # of critics
+    "ranks_well": 0.8,  # share of pairs of actions in the order of their rewards, at least
+    "ranks_badly": 0.65,  # below; chance is 0.5
+    "actor_lags": 0.3,  # normalised regret, at least
+    "level_bias": 0.2,  # of the critic's level, over the mean size of the value, at least
+    "maturity": 2.0,  # (1 − γ) τ updates, below
     # of teams
     "blame_ratio": 1.5,  # of an agent's share of the regret to its share of the channels
     "one_suffices": 0.5,  # share of the team's regret that correcting one agent removes, at least

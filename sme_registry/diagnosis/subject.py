@@ -47,6 +47,7 @@ class Subject:
     explore: Callable[[Observation], Any] | None = None  # the algorithm's stochastic actions
     checkpoint_step: int | None = None  # of an unfinished run, the steps at its checkpoint
     updates: int | None = None  # of the algorithm; None if unknown
+    model: Any = None  # of Stable-Baselines3, which may have a critic
 
     @property
     def document(self) -> SMESpec:
@@ -224,7 +225,7 @@ def _subject(
         return Subject(name or team.name, spec, team, **known)
     policy = numpy_policy(model, spec, action_range=action_range)
     explore = exploration(model, policy)
-    return Subject(name or policy.name, spec, policy, explore=explore, **known)
+    return Subject(name or policy.name, spec, policy, explore=explore, model=model, **known)
 
 
 def _networks(

@@ -19,6 +19,8 @@ from pydantic import JsonValue
 
 from sme_registry.diagnosis import behaviour, measure
 from sme_registry.diagnosis.behaviour import CapacityProbe
+from sme_registry.diagnosis.critic_rules import CRITIC
+from sme_registry.diagnosis.critics import critic, has_critic
 from sme_registry.diagnosis.document import (
     Diagnosis,
     Level,
@@ -51,7 +53,7 @@ from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 from sme_registry.task.task import Observation
 
-TASK_QUESTIONS = {**WHERE, **WHY}
+TASK_QUESTIONS = {**WHERE, **WHY, **CRITIC}
 
 
 def diagnose_task(
@@ -102,6 +104,9 @@ def _measurements(
     if subject.explore is not None:
         explored = behaviour.exploration_sd(subject.explore, sample.observation, seed)
         fields["exploration_sd"] = explored
+    if has_critic(subject.model, task):
+        report(f"{subject.name}: the critic against exact values")
+        fields["critic"] = critic(subject.model, task, states=min(states, 500), seed=seed)
     if not subject.spec.is_plain:
         report(f"{subject.name}: limits and distractors")
         fields |= _limits_and_distractors(policy, task, sample, runs[POLICY], seed)

@@ -75,9 +75,11 @@ def values(
     first = _rows("actions", actions, (B, spec.action_dim))
     if policy == "optimal" and first is None and horizon == "finite" and _has_formula(spec, gamma):
         return _of_optimum(task, s, steps, gamma)
-    begun = {"t": steps, "r_cum": r_cum, "distractors": d, "actions": first}
     acting = as_policy(policy, spec)
-    returns = expected_returns(task, acting, s, gamma=gamma, samples=samples, seed=seed, **begun)
+    returns = expected_returns(
+        task, acting, s, t=steps, gamma=gamma, samples=samples, seed=seed,
+        r_cum=r_cum, distractors=d, actions=first,
+    )  # fmt: skip
     if horizon == "finite":
         return returns.finite
     return returns.finite + returns.left * value_after_end(task, acting, gamma, seed)

@@ -139,6 +139,10 @@ def set_weights(model: Any, weights: Mapping[str, npt.NDArray[Any]], steps: int)
     for name in tensors.keys() - names:
         getattr(model, name).data.copy_(tensors[name])
     model.num_timesteps = steps
+    if hasattr(model, "learning_starts"):
+        every = model.train_freq.frequency
+        updates = model.gradient_steps if model.gradient_steps >= 0 else every
+        model._n_updates = max(0, steps - model.learning_starts) // every * updates
 
 
 def save_checkpoint(model: Any, path: Path) -> None:

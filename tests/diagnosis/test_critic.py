@@ -1,5 +1,7 @@
 """Critics against exact values: whose value, which order of actions, and models without one."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,11 @@ pytest.importorskip("stable_baselines3")
 import torch
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
-from sme_registry.diagnosis import critic
+from sme_registry.diagnosis import critic, diagnose, load_policy
+from sme_registry.diagnosis.critics import CriticRegion, CriticReport, CriticTime
+from sme_registry.diagnosis.figures import draw
+from sme_registry.diagnosis.task import diagnosed
+from tests.diagnosis.policies import DEEP, SPEC, diagnosis_of
 
 SMALL = {"horizon": 20, "state_dim": 3, "action_dim": 2}
 
@@ -120,3 +126,60 @@ def test_levels_over_time_fall_towards_the_end_of_an_episode_and_continuing_ones
 def test_a_model_without_that_critic_is_refused(judged, arguments, says):
     with pytest.raises(SMEError, match=says):
         critic(judged(), **{"task": SMESpec(**SMALL)} | arguments)
+
+
+def report_of(ranking=0.9, outside=0.9, misled=None, bias=0.0, gamma=0.9, sweeps=100.0):
+    """What `critic` could find: the rankings in the cube and in the outermost shell, and a bias."""
+
+    def region(name, share):
+        return CriticRegion(
+            region=name, states=100, ranking=share, misled_ranking=misled, claim=1.0 + bias,
+            finite=1.0, continuing=1.0, bias=bias, bias_share=bias,
+        )  # fmt: skip
+
+    shares = {"visited": ranking, "WD": ranking, "OOD 5": outside}
+    return CriticReport(
+        algorithm="TD3", kind="Q", spec_digest=SPEC.digest, gamma=gamma, sweeps=sweeps, seed=0,
+        regions=[region(name, share) for name, share in shares.items()],
+        times=[CriticTime(time=0.5, claim=1.0 + bias, finite=0.5, continuing=1.0)],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("found", "question", "reason"),
+    [
+        ({"ranking": 0.9}, "critic_ranking", "critic_ahead_of_actor"),
+        ({"ranking": 0.5}, "critic_ranking", "critic_ranks_badly"),
+        ({"ranking": 0.7}, "critic_ranking", "critic_between"),
+        ({"ranking": None, "outside": None}, "critic_ranking", "critic_of_states"),
+        ({"outside": 0.5}, "critic_outside", "ranks_inside_only"),
+        ({}, "critic_outside", "ranks_alike"),
+        ({"ranking": 0.5, "misled": 0.9}, "discount", "misled_by_discount"),
+        ({"ranking": 0.5, "misled": 0.5}, "discount", "not_misled"),
+        ({}, "discount", "nothing_misleads"),
+        ({"bias": -0.85, "gamma": 0.99, "sweeps": 15.0}, "critic_level", "level_immature"),
+        ({"bias": -0.85}, "critic_level", "level_biased"),
+        ({"bias": 0.1}, "critic_level", "level_right"),
+    ],
+)
+def test_what_is_found_of_a_critic_has_its_verdict_and_a_sentence_with_numbers(
+    found, question, reason
+):
+    measured = diagnosis_of("linear", DEEP).measurements.model_copy(
+        update={"critic": report_of(**found)}
+    )
+    verdict = diagnosed(load_policy("linear", DEEP), measured).verdict(question)
+    assert verdict.reason == reason
+    assert len(verdict.sentence()) > 20
+
+
+def test_a_diagnosis_of_a_model_has_its_critic_and_draws_it(laid_out):
+    pytest.importorskip("matplotlib")
+    spec = SMESpec(**SMALL, shaping={"scale": 3})
+    diagnosis = diagnose(load_policy(model(TD3, spec=spec), spec), states=64, episodes=8)
+    assert diagnosis.measurements.critic.region("OOD 5").misled_ranking is not None
+    assert diagnosis.verdict("critic_level").evidence["gamma"] == 0.9
+    draw(diagnosis, Path("unused"))
+    labels = [axes.get_ylabel() for figure in laid_out for axes in figure.axes]
+    assert "discounted value" in labels
+    assert "critic" not in diagnosis_of("linear", DEEP).model_dump()["measurements"]

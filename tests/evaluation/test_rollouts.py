@@ -11,7 +11,7 @@ import pytest
 
 import sme_registry
 from sme_registry import SMESpec, load, make_parallel, materialize
-from sme_registry.errors import ActionError, SpecError, StateError
+from sme_registry.errors import ActionError, SpecError
 from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
@@ -178,18 +178,12 @@ def test_start_states_are_new_at_each_evaluation_and_the_same_when_asked_again()
 
 
 @pytest.mark.parametrize(
-    ("policy", "moved", "channels", "error", "message"),
-    [
-        (nearly_optimal(PLAIN), 1.0, 3, StateError, r"outside \[0, 1\]"),
-        (nearly_optimal(PLAIN), 0.0, 2, StateError, "must be of shape"),
-        (lambda o: o[:, :1], 0.0, 3, ActionError, "must be of shape"),
-        (lambda o: o[:, :2] * np.nan, 0.0, 3, ActionError, "NaN"),
-    ],
+    ("policy", "message"),
+    [(lambda o: o[:, :1], "must be of shape"), (lambda o: o[:, :2] * np.nan, "NaN")],
 )
-def test_what_cannot_be_rolled_out_is_refused(policy, moved, channels, error, message):
-    states = start_states(0, 0, 2, 3)[:, :channels] + moved
-    with pytest.raises(error, match=message):
-        rollouts(policy, materialize(PLAIN), states)
+def test_what_cannot_be_rolled_out_is_refused(policy, message):
+    with pytest.raises(ActionError, match=message):
+        rollouts(policy, materialize(PLAIN), start_states(0, 0, 2, 3))
 
 
 def test_one_policy_for_a_team_is_refused():

@@ -1,0 +1,90 @@
+"""The questions about a critic: does the actor follow it, where does it rank, is its level due?"""
+
+from __future__ import annotations
+
+from functools import partial
+
+from sme_registry.diagnosis.critics import VISITED, CriticReport
+from sme_registry.diagnosis.document import TaskDiagnosis
+from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Questions, add_to
+
+CRITIC: Questions = {}
+"""Asked where the policy's model has a critic that can be read."""
+_about = partial(add_to, CRITIC, "why", needs="critic")
+
+
+def _critic_of(run: TaskDiagnosis) -> CriticReport:
+    assert run.measurements.critic is not None  # the questions are asked only then
+    return run.measurements.critic
+
+
+@_about(
+    yes="critic_ahead_of_actor",
+    no="actor_follows critic_ranks_badly critic_between critic_of_states",
+    thresholds="ranks_well ranks_badly actor_lags",
+)
+def _critic_ranking(run: TaskDiagnosis) -> Decision:
+    ranking = _critic_of(run).region(VISITED).ranking
+    if ranking is None:
+        return Decision("critic_of_states", {})
+    evidence = {"ranking": ranking, "normalised_regret": run.learnt}
+    if ranking < THRESHOLDS["ranks_badly"]:
+        return Decision("critic_ranks_badly", evidence)
+    if run.learnt < THRESHOLDS["actor_lags"]:
+        return Decision("actor_follows", evidence)
+    ahead = ranking >= THRESHOLDS["ranks_well"]
+    return Decision("critic_ahead_of_actor" if ahead else "critic_between", evidence)
+
+
+@_about(
+    yes="ranks_inside_only",
+    no="ranks_alike critic_of_states",
+    thresholds="ranks_well ranks_badly",
+)
+def _critic_outside(run: TaskDiagnosis) -> Decision:
+    report = _critic_of(run)
+    inside, outside = report.region("WD"), report.regions[-1]
+    if inside.ranking is None or outside.ranking is None:
+        return Decision("critic_of_states", {})
+    only = inside.ranking >= THRESHOLDS["ranks_well"]
+    only = only and outside.ranking < THRESHOLDS["ranks_badly"]
+    evidence = {"wd": inside.ranking, "outside": outside.ranking, "region": outside.region}
+    return Decision(only, evidence)
+
+
+@_about(
+    yes="misled_by_discount",
+    no="not_misled nothing_misleads",
+    thresholds="ranks_well ranks_badly",
+)
+def _discount(run: TaskDiagnosis) -> Decision:
+    report = _critic_of(run)
+    cube = report.region("WD")
+    if cube.misled_ranking is None or cube.ranking is None:
+        return Decision("nothing_misleads", {})
+    misled = cube.misled_ranking >= THRESHOLDS["ranks_well"]
+    misled = misled and cube.ranking < THRESHOLDS["ranks_badly"]
+    evidence = {"ranking": cube.ranking, "misled_ranking": cube.misled_ranking}
+    return Decision(misled, evidence | {"gamma": report.gamma})
+
+
+@_about(
+    yes="level_immature",
+    no="level_right",
+    unclear="level_biased",
+    thresholds="level_bias maturity",
+)
+def _critic_level(run: TaskDiagnosis) -> Decision:
+    report = _critic_of(run)
+    cube = report.region("WD")
+    evidence = {
+        **cube.model_dump(include={"claim", "finite", "continuing", "bias_share"}),
+        "sweeps": report.sweeps,
+        "gamma": report.gamma,
+    }
+    if abs(cube.bias_share) < THRESHOLDS["level_bias"]:
+        return Decision("level_right", evidence)
+    # A critic that starts at 0 has covered about 1 − exp(−(1 − γ) sweeps) of the way to its level.
+    sweeps = float("inf") if report.sweeps is None else report.sweeps
+    immature = (1 - report.gamma) * sweeps < THRESHOLDS["maturity"]
+    return Decision("level_immature" if immature else "level_biased", evidence)
