@@ -20,7 +20,7 @@ CONTRACT = {
     "SMESpec", "StreamSpec", "EvaluationProtocol", "Task", "load", "save", "register",
     "materialize", "make", "make_vec", "make_parallel", "make_aec", "env_spec", "evaluate",
     "EvaluationReport", "StreamReport", "train", "train_offline", "make_dataset", "export_onnx",
-    "diagnose", "run_study", "load_study", "compare", "SMEError",
+    "diagnose", "run_study", "load_study", "compare", "SMEError", "values",
 }  # fmt: skip
 
 

@@ -23,6 +23,15 @@ QUANTITIES = {
     "regret_slope": "slope of normalised regret over the shells' ε",
     "similarity_decay": "(r̃_WD − r̃_m)/r̃_WD",
     "similarity_loss": "100 (r̃_WD − r̃_m), points",
+    # Critics against exact values
+    "ranking": "share of pairs of actions that a critic orders as the step reward does",
+    "misled_ranking": "the same against what shaping leaves to a learner of this γ",
+    "claim": "mean of what a critic says",
+    "finite": "mean exact discounted value to the end of the episode",
+    "continuing": "mean exact discounted value if the episode went on",
+    "bias": "claim − the value that the critic estimates",
+    "bias_share": "bias / |mean of that value|",
+    "sweeps": "τ × updates of the targets",
     # Safety and observation
     "cost": "mean_i max(0, a_i − ℓ_i)/(2τ), mean over states",
     "violating_share": "share of states with an action channel above its limit",
