@@ -26,8 +26,8 @@ _STEPS = 12  # of the drawn trajectory
 
 
 def overview() -> Figure:
-    """A task with a trajectory, PPO's regret as it learns, and its decay outside the cube."""
-    depths = {"L = 1": 1, "L = 10": 10}
+    """A task with a trajectory, PPO's regret as it learns, and its similarity in the cube and shells."""
+    depths = {"1 layer": 1, "10 layers": 10}
     runs: dict[str, list[Any]] = {name: [] for name in depths}
     reports: dict[str, list[EvaluationReport]] = {name: [] for name in depths}
     default = spec_of("Default")
@@ -45,9 +45,14 @@ def overview() -> Figure:
         _draw_trajectory(task)
         learning_curve(runs, ax=learning)
         learning.set(title="Exact regret while PPO learns", ylabel="mean regret per step")
-        decay_curve(reports, measures=("normalised_regret",), references=False, ax=[decay])
-        decay.set(title="… and outside the training cube", ylabel="normalised regret")
-        legend_below(figure, learning.get_legend_handles_labels()[0])
+        decay_curve(reports, measures=("similarity",), references=False, ax=[decay])
+        decay.axhline(1, color=GREY, linewidth=1.2)
+        decay.set(title="… and afterwards, cube and shells", ylabel="similarity to the optimum")
+        decay.set(xlabel="region: the training cube, shells 1 to 5", ylim=(0.7, 1.02))
+        decay.set_xticks(decay.get_xticks(), ["cube", *"12345"])
+        handles = learning.get_legend_handles_labels()[0]
+        handles[-1].set_label("quartiles of runs")  # one line is a median, the other an IQM
+        legend_below(figure, handles)
         return figure
 
 

@@ -54,7 +54,8 @@ def test_the_figure_of_ranks_has_the_numbers_of_the_baselines():
     assert baselines["TD3"] == [(0.349, 0.231, 0.467), (0.439, 0.322, 0.556)]
 
 
-def test_the_figure_of_an_overview_shows_three_runs_at_each_depth():
-    legend = results.overview().legends[0]
-    labels = [text.get_text() for text in legend.get_texts()]
-    assert labels[:2] == ["L = 1 (n = 3)", "L = 10 (n = 3)"]
+def test_the_figure_of_an_overview_shows_the_similarity_of_three_runs_at_each_depth():
+    figure = results.overview()
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels[:2] == ["1 layer (n = 3)", "10 layers (n = 3)"]
+    assert figure.axes[-1].get_ylabel() == "similarity to the optimum"
