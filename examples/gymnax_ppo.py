@@ -25,7 +25,7 @@ try:
 
     from sme_registry.jax.gymnax import Environment
 except ModuleNotFoundError as error:
-    sys.exit(f"{error.name} is not installed. docs/guides/frameworks.md has the command.")
+    sys.exit(f"{error.name} is not installed. docs/guides/training.md has the command.")
 
 ENVS, ROLLOUT = 8, 1024
 

@@ -29,7 +29,7 @@ try:
 except ModuleNotFoundError as error:
     sys.exit(
         f"{error.name} is not installed. pip install 'ray[rllib]' has it, and all else that RLlib "
-        "needs; docs/guides/frameworks.md says what it replaces."
+        "needs; docs/guides/training.md says what it replaces."
     )
 
 ROLLOUT = 2048

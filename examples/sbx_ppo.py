@@ -19,7 +19,7 @@ import sme_registry
 try:
     from sbx import PPO
 except ModuleNotFoundError as error:
-    sys.exit(f"{error.name} is not installed. docs/guides/frameworks.md has the command.")
+    sys.exit(f"{error.name} is not installed. docs/guides/training.md has the command.")
 
 ENVS, ROLLOUT = 8, 1024
 

@@ -29,7 +29,7 @@ try:
     from tianshou.utils.net.common import Net
     from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
 except ModuleNotFoundError as error:
-    sys.exit(f"{error.name} is not installed. docs/guides/frameworks.md has the command.")
+    sys.exit(f"{error.name} is not installed. docs/guides/training.md has the command.")
 
 ENVS, ROLLOUT = 8, 1024
 

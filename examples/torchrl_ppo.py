@@ -27,7 +27,7 @@ try:
     from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
     from torchrl.objectives import ClipPPOLoss, ValueEstimators
 except ModuleNotFoundError as error:
-    sys.exit(f"{error.name} is not installed. docs/guides/frameworks.md has the command.")
+    sys.exit(f"{error.name} is not installed. docs/guides/training.md has the command.")
 
 ENVS, ROLLOUT, EPOCHS, MINIBATCH = 8, 1024, 10, 128
 

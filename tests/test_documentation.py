@@ -24,7 +24,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
         *(
             f"docs/guides/{name}.md"
             for name in (
-                "specs", "streams", "teams", "training", "datasets", "figures", "frameworks",
+                "specs", "streams", "teams", "training", "datasets", "figures",
                 "retention", "safety_and_observation",
             )
         ),

@@ -26,7 +26,7 @@ _STEPS = 12  # of the drawn trajectory
 
 
 def overview() -> Figure:
-    """A task with a trajectory, PPO's regret as it learns, and its similarity in the cube and shells."""
+    """A task with a trajectory, PPO's regret as it learns, and its similarity by region."""
     depths = {"1 layer": 1, "10 layers": 10}
     runs: dict[str, list[Any]] = {name: [] for name in depths}
     reports: dict[str, list[EvaluationReport]] = {name: [] for name in depths}
