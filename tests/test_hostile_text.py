@@ -152,7 +152,7 @@ def test_documents_of_the_core_show_foreign_text_as_escapes(folder):
     printed("sme", "new", "mine.json", "--description", "plain")
     file = json.loads((folder / "mine.json").read_text())
     (folder / "evil.json").write_text(json.dumps({**file, "description": HOSTILE}))
-    for line in ("show evil.json", "show evil.json --json", "validate evil.json"):
+    for line in ("show evil.json", "show evil.json --json", "check evil.json"):
         assert_clean(printed("sme", *line.split()))
 
 

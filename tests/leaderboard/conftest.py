@@ -3,6 +3,7 @@
 import functools
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -16,6 +17,10 @@ from sme_registry.spec import Suite
 from tests.leaderboard.clocks import move_clock
 
 Submit = Callable[..., Signed[Submission]]
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = ROOT / "examples" / "board"
+SEASONS = ROOT / "docs" / "results" / "season" / "board"
+"""Of rules 2, with two revealed seasons."""
 
 
 def suite_of(**classes):

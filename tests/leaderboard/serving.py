@@ -72,6 +72,14 @@ def receiver(url, address=None):
     return Receiver(board, address or url)
 
 
+def alive(pid):
+    """Whether a process has this id and has not ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 @contextlib.contextmanager
 def serving_process(path, workers=0):
     """A server in a process, as `serve` runs it; yields its URL and the process."""

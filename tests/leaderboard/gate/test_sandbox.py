@@ -32,6 +32,7 @@ from tests.leaderboard.gate.models import (
     value,
     weights,
 )
+from tests.leaderboard.serving import alive
 from tests.leaderboard.store.crashing import fork
 
 LIMITS = SandboxLimits()
@@ -453,13 +454,6 @@ def test_a_killed_parent_leaves_no_child_behind(isolation, ungated):
     while alive(child) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not alive(child)
-
-
-def alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def test_a_missing_onnxruntime_is_an_error_with_the_install_command(monkeypatch, unconfined):

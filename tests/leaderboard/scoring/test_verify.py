@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -20,7 +19,7 @@ from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import LogEntry, Objects, Store
 from sme_registry.errors import OptionError
 from sme_registry.io import to_json
-from tests.leaderboard.conftest import document_path
+from tests.leaderboard.conftest import EXAMPLE, SEASONS, document_path
 from tests.leaderboard.scoring.conftest import (
     FAILED,
     REFUSED,
@@ -34,7 +33,6 @@ from tests.leaderboard.scoring.conftest import (
     with_runs,
 )
 
-EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "board"
 LAST = 10
 
 
@@ -271,11 +269,8 @@ def test_a_result_of_an_earlier_version_that_gives_single_runs_an_interval_is_ac
     assert difference({"value": 0.6, "low": 0.6, "high": 0.6}, single, 1e-12)
 
 
-OLD = EXAMPLE.parents[1] / "docs" / "results" / "season" / "board"
-
-
 def test_a_board_of_rules_2_is_read_where_its_documents_lie_and_accepts_nothing(tmp_path):
-    board = shutil.copytree(OLD, tmp_path / "board")
+    board = shutil.copytree(SEASONS, tmp_path / "board")
     report = verify(board, board=SeasonStore)
     assert (report.log_sequence, len(report.missing), report.notes) == (30, 6, ())
     with SeasonStore.open(board) as store:

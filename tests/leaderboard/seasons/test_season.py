@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,7 +43,7 @@ from sme_registry.errors import SMEError
 from sme_registry.evaluation import evaluate_many
 from sme_registry.io import sha256_of
 from sme_registry.seasons.wire import pack_table, unpack_table
-from tests.leaderboard.conftest import tiny_board
+from tests.leaderboard.conftest import ROOT, SEASONS, tiny_board
 from tests.leaderboard.seasons.sealing import (
     MASTER,
     NOTHING,
@@ -184,7 +183,7 @@ def test_answers_must_fit_a_board_and_somebody_must_be_able_to_have_a_rank():
 
 
 def test_the_plan_in_the_documentation_is_one():
-    page = (Path(__file__).parents[3] / "docs" / "guides" / "seasons.md").read_text()
+    page = (ROOT / "docs" / "guides" / "seasons.md").read_text()
     [text] = re.findall(r"```json\n(.*?)```", page, re.S)
     terms = read_plan(json.loads(text))
     assert len(terms.published) == 10
@@ -318,7 +317,7 @@ def test_digests_do_not_depend_on_the_processor(season, kernel):
     done = subprocess.run(
         [sys.executable, "-c", KERNEL],
         env={**os.environ, "OPENBLAS_CORETYPE": kernel},
-        cwd=Path(__file__).parents[3],
+        cwd=ROOT,
         capture_output=True,
         text=True,
     )
@@ -403,9 +402,6 @@ def test_the_tickets_of_each_method_have_their_own_scores_and_rank(
     assert shown == [("Good", 0.5, 4, reason), ("Bad", 1.0, 4, reason)]
 
 
-BOARD = Path(__file__).resolve().parents[3] / "docs" / "results" / "season" / "board"
-
-
 def results(store, season):
     """The counting results of a season by method."""
     found = {}
@@ -424,7 +420,7 @@ def tops(ranked):
 
 
 def test_both_seasons_are_ranked_as_the_page_says():
-    with SeasonStore.open(BOARD, read_only=True) as store:
+    with SeasonStore.open(SEASONS, read_only=True) as store:
         for season, best in (("winter", ["SAC", "PPO"]), ("autumn", ["IQL", "BC"])):
             document = store.season(season)
             assert document.is_committed_to(store.revealed_master(season))
@@ -434,13 +430,13 @@ def test_both_seasons_are_ranked_as_the_page_says():
             assert names[-1] == "Constant 0.5"
             own, others = (dict(tops(ranked[kind])) for kind in ("family", "generic"))
             assert all(own["Family fit (short)"] < others[name] for name in best)
-    assert not list(BOARD.rglob("*.key"))
-    assert sum(path.stat().st_size for path in BOARD.rglob("*") if path.is_file()) < 3_500_000
+    assert not list(SEASONS.rglob("*.key"))
+    assert sum(path.stat().st_size for path in SEASONS.rglob("*") if path.is_file()) < 3_500_000
 
 
 def test_both_seasons_are_verified_on_every_processor():
     """Autumn's data sets are not committed; another processor may round them otherwise."""
-    with SeasonStore.open(BOARD, read_only=True) as store:
+    with SeasonStore.open(SEASONS, read_only=True) as store:
         rows, notes = verify_seasons(store, lambda what: None)
         assert notes == []
         counts = {row.what: row.checked for row in rows if "scored again" in row.what}

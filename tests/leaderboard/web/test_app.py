@@ -36,7 +36,7 @@ from tests.leaderboard.conftest import (
     tiny_board,
     tiny_submission,
 )
-from tests.leaderboard.serving import authorization, serving, serving_process
+from tests.leaderboard.serving import alive, authorization, serving, serving_process
 from tests.leaderboard.web import boards
 
 # More patient than httpx, for busy machines; a connection for each request, as `httpx.get` has.
@@ -723,7 +723,7 @@ def test_serving_outlives_its_scorers_and_stops_cleanly(tmp_path):
             _, err = process.communicate(timeout=60)
         assert (process.returncode, err) == (0, "")
         # Multiprocessing's own tracker ends by itself, a moment after those that it watched.
-        while [child for child in children if _is_alive(child)]:
+        while [child for child in children if alive(child)]:
             assert time.monotonic() < deadline
             time.sleep(0.05)
 
@@ -741,12 +741,5 @@ def _may_be_killed(pid):
     """A scorer, or what it started; without its tracker, `multiprocessing` writes warnings."""
     try:
         return b"resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return False
-
-
-def _is_alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False

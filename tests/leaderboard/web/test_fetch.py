@@ -1,7 +1,6 @@
 """`fetch`: what a copy has, how it goes on, and what a server cannot make it write."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -14,11 +13,8 @@ from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.verify import verify_seasons
 from leaderboard.store import Store
 from leaderboard.web.client import ServedBoard, fetch
+from tests.leaderboard.conftest import EXAMPLE, SEASONS
 from tests.leaderboard.serving import serving
-
-ROOT = Path(__file__).resolve().parents[3]
-EXAMPLE = ROOT / "examples" / "board"
-SEASONS = ROOT / "docs" / "results" / "season" / "board"  # of rules 2, with two revealed seasons
 
 
 @pytest.fixture

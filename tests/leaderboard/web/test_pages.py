@@ -5,7 +5,6 @@ import re
 import shutil
 from collections import Counter
 from html.parser import HTMLParser
-from pathlib import Path
 from urllib.parse import urlsplit
 from xml.etree import ElementTree
 
@@ -13,10 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from leaderboard import admission
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Estimate
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import NotPublishable
+from leaderboard.scoring.worker import run_scorer
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Copies, Store
 from leaderboard.web import charts, tables
@@ -24,11 +25,9 @@ from leaderboard.web import pages as site_pages
 from leaderboard.web.pages import Pages, content_type
 from leaderboard.web.server import write_site
 from sme_registry.errors import OptionError
-from tests.leaderboard.conftest import signed_withdrawal
+from tests.leaderboard.conftest import SEASONS, signed_withdrawal
 from tests.leaderboard.web import boards
 
-EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "board"
-OLD = EXAMPLE.parents[1] / "docs" / "results" / "season" / "board"  # of rules 2
 VOID = {"meta", "link", "input", "br", "img"}
 ELEMENTS = """
 html head meta title link script body a header footer main nav div section p span strong em small
@@ -189,7 +188,7 @@ def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(boa
         assert any(a["href"].endswith("index.html#submit") for a in page.all("a")), name
     page = Page(html(Pages(board[0], "https://x/<script>"), "index.html"))
     assert "submit runs/mine https://x/<script>" in page.words
-    with SeasonStore.open(OLD, read_only=True) as store:
+    with SeasonStore.open(SEASONS, read_only=True) as store:
         words = Page(html(Pages(store), "index.html")).words.split("How to submit")[1]
     assert "accepts no submissions" in words
     assert "sme-leaderboard submit" not in words
@@ -511,17 +510,19 @@ def test_contrast_is_enough_in_light_and_dark(board):
         assert contrast(colour["axis"], colour["surface"]) >= 3
 
 
-def test_explorers_are_written_on_request_and_linked(tmp_path):
-    with Store.open(shutil.copytree(EXAMPLE, tmp_path / "board")) as store:
-        site = write_site(store, tmp_path / "site", explorers=True).parent
-        listed = [*Pages(store, explorers=True).paths()]
-        assert not any("explorer" in path for path in Pages(store).paths())
-        assert Pages(store).read(next(p for p in listed if p.startswith("explorers/"))) is None
-        assert Pages(store, explorers=True).read("explorers/x-0.html") is None
+def test_explorers_are_written_on_request_and_linked(tmp_path, store, submit):
+    admission.submit_references(store)
+    submit(300)
+    assert run_scorer(store.folder.path) == 3
+    site = write_site(store, tmp_path / "site", explorers=True).parent
+    listed = [*Pages(store, explorers=True).paths()]
+    assert not any("explorer" in path for path in Pages(store).paths())
+    assert Pages(store).read(next(p for p in listed if p.startswith("explorers/"))) is None
+    assert Pages(store, explorers=True).read("explorers/x-0.html") is None
     pages = {path for path in listed if path.startswith("explorers/")}
     texts = "".join(page.read_text() for page in (site / "submissions").glob("*.html"))
     assert set(re.findall(r"explorers/[^\"]+", texts)) == pages
-    assert len(pages) > 2
+    assert len(pages) == 3
     texts = "".join((site / path).read_text() for path in pages)
     assert '"of":"observation"' in texts
     for name in re.findall(r'(?:src|href)="\.\./(static/[^"]+)"', texts):
