@@ -24,7 +24,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
         *(
             f"docs/guides/{name}.md"
             for name in (
-                "specs", "streams", "teams", "training", "datasets", "figures",
+                "specs", "streams", "teams", "training", "datasets", "studies",
                 "retention", "safety_and_observation",
             )
         ),
