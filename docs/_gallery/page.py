@@ -48,7 +48,8 @@ _JOINT, _FIXED = "\u2060", "\u00a0"  # narrow lines do not break at a dash, a ×
 READING = """\
 - **The pictures** show two action channels of π* over two state channels from −½ to 1½, with all
   others at ½: dark is 0, light is 1. The square is the cube in which agents train. Lines cross out
-  where a limit forbids π*. [An explorer](../../guides/diagnosis.md#explore-any-state) shows any two channels.
+  where a limit forbids π*. [An explorer](../../guides/diagnosis.md#explore-any-state) shows
+  any two channels.
 - **`sme check`** certifies the drawn task; a warning means that it is correct but easy. Rewards
   are those of a step, at most 1.
 - **N₀ and N̄** are normalised regret in the cube and outside it, the mean of five shells: 0 is the
