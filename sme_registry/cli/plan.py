@@ -44,14 +44,16 @@ from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.budget import (
     Estimator,
+    in_implementation,
     scaled,
     selected,
     uneven_rollouts,
-    with_agents,
     with_sources,
 )
 from sme_registry.studies.ledger import Ledger
 from sme_registry.training.algorithms import (
+    AGENTS,
+    BACKENDS,
     check_algorithm,
     code_notice,
     folder_name,
@@ -60,6 +62,15 @@ from sme_registry.training.algorithms import (
 )
 
 _EVERY = "*"  # algorithm
+Agents = Annotated[
+    str | None,
+    typer.Option(
+        metavar="|".join(AGENTS),
+        help="The implementation that is trained: "
+        f"{', or '.join(f'{kind}, of {BACKENDS[kind].title}' for kind in AGENTS)}. Default the one "
+        "that the algorithm names.",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,14 +98,7 @@ class Budgets:
             help="Evaluations during each training. Default the plan's, of a new plan 100."
         ),
     ] = None
-    agents: Annotated[
-        str | None,
-        typer.Option(
-            metavar="sb3|jax",
-            help="Implementation of PPO, TD3 and SAC: of Stable-Baselines3, or in JAX, with the "
-            "environment in one program. Default as in the plan.",
-        ),
-    ] = None
+    agents: Agents = None
 
     def scaled(self, file: StudyFile) -> StudyFile:
         texts = [text if "=" in text else f"{_EVERY}={text}" for text in self.steps or ()]
@@ -109,7 +113,7 @@ class Budgets:
         every = steps.pop(_EVERY, None)
         counts = {"seeds": self.seeds, "evaluations": self.evaluations}
         file = scaled(file, steps=every, steps_of=steps, **counts)
-        return file if self.agents is None else with_agents(file, self.agents)
+        return file if self.agents is None else in_implementation(file, self.agents)
 
 
 @dataclass(frozen=True, kw_only=True)

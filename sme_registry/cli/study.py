@@ -113,14 +113,12 @@ def run(
       sme study run paper-ablations -f runs/jax --agents jax --only algorithm=PPO
       sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
     """
-    if ray is not None and executor not in (None, "ray"):
-        raise OptionError(f"--ray {ray}: contradicts --executor {executor}. Leave one out.")
     status = run_study(
         options.scaled(find_file(StudyFile, plan)),
         folder,
-        executor=executor or ("processes" if ray is None else "ray"),
+        executor=executor,
         jobs=jobs,
-        ray=ray or "local",
+        ray=ray,
         retry_failed=retry,
         keep_models=keep_models,
         only=only or (),

@@ -23,7 +23,7 @@ from sme_registry.cli.arguments import (
     print_written,
     with_options,
 )
-from sme_registry.cli.plan import Jobs, warn_of_uneven_rollouts
+from sme_registry.cli.plan import Agents, Jobs, warn_of_uneven_rollouts
 from sme_registry.cli.study import check_complete, print_status
 from sme_registry.datasets import open_dataset, train_offline
 from sme_registry.datasets.documents import check_algorithm
@@ -103,14 +103,7 @@ class Settings:
             help="Change a field of the task or a hyperparameter of the algorithm. Repeatable.",
         ),
     ] = None
-    agents: Annotated[
-        str | None,
-        typer.Option(
-            metavar="sb3|jax",
-            help="Implementation of PPO, TD3 and SAC: of Stable-Baselines3 (default), or in JAX, "
-            "with the environment in one program.",
-        ),
-    ] = None
+    agents: Agents = None
     suite: Annotated[
         str | None,
         typer.Option(

@@ -27,7 +27,7 @@ from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell
 from sme_registry.task.task import Observation
 from sme_registry.training import record as run_files
-from sme_registry.training.algorithms import find, in_jax, parse_uses
+from sme_registry.training.algorithms import backend_of, find, parse_uses
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import CHECKPOINT, RunRecord
 
@@ -248,7 +248,8 @@ def _model_of_run(folder: Path, record: RunRecord) -> tuple[Path, int | None]:
     model, checkpoint = folder / record.model_name, folder / CHECKPOINT
     if model.exists():
         return model, None
-    if checkpoint.exists() and not record.independent and not in_jax(record.algorithm):
+    readable = not (record.independent or backend_of(record.algorithm).own_checkpoint)
+    if checkpoint.exists() and readable:
         return checkpoint, record.steps_done
     raise OptionError(
         f"run={str(folder)!r}: has neither {record.model_name} nor a {CHECKPOINT} that can be "

@@ -13,11 +13,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
-from sme_registry.io import choice
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.result import CellResult
-from sme_registry.training.algorithms import AGENTS, find, parse_uses
+from sme_registry.training.algorithms import backend_of, find, parse_uses, with_agents
 from sme_registry.training.functions import source_of
 
 # Seconds of one training step with default hyperparameters on a fast core.
@@ -104,18 +103,14 @@ def scaled(
     return _renamed(file, plan, "-scaled")
 
 
-def with_agents(file: StudyFile, agents: str) -> StudyFile:
-    """The plan with other implementations of its algorithms."""
-    choice("agents", agents, AGENTS)
+def in_implementation(file: StudyFile, agents: str) -> StudyFile:
+    """The plan with the implementations of `agents`; references and offline learners stay."""
     fields = file.plan.to_dict()
     for algorithm in fields["algorithms"]:
         uses = algorithm["uses"]
-        kind, name = parse_uses(uses)
-        if agents == "sb3":
-            algorithm["uses"] = name if kind == "jax" else uses
-        elif kind not in ("reference", "offline"):
-            field = f"algorithm {algorithm['name']!r}: uses"
-            algorithm["uses"] = find(uses if kind == "jax" else f"jax:{uses}", field).uses
+        changed = with_agents(uses, agents)
+        if changed != uses and backend_of(uses).learner:
+            algorithm["uses"] = find(changed, f"algorithm {algorithm['name']!r}: uses").uses
     plan = StudyPlan.from_dict(fields, f"the plan with agents={agents}")
     return _renamed(file, plan, f"-{agents}")
 

@@ -73,7 +73,7 @@ def run_cell(
     entry = find(cell.uses)
     entry.check_task(cell.document)
     check_hyperparameters(cell.uses, cell.hyperparameters)
-    if entry.kind == "jax":
+    if entry.backend.in_programs:
         return _run_alone(cell, progress, model_path)
     with entry.surroundings():
         if entry.kind == "offline":

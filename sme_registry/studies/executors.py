@@ -3,7 +3,8 @@
 Every executor is one `map`: it takes the next job when a worker is free, a cell or the cells of one
 program, and yields the outcomes in the order in which cells end. Its caller writes them: only the
 driver touches the study's folder, except for the states of programs, which may be gigabytes.
-A new executor is a class here, and a row of `EXECUTORS`.
+A new executor is a class here and a row of `EXECUTORS`; one with an address is an argument of
+`run_study` and an option of `sme study run`, too.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ import time
 import traceback
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sme_registry.errors import OptionError
-from sme_registry.io import require_packages
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.io import choice, require_packages
 from sme_registry.io.system import (
     available_cores,
     block_interrupts,
@@ -70,16 +71,17 @@ class Executor(ABC):
     """
 
     local: ClassVar[bool] = True  # whether jobs have the files and devices of this machine
+    default_address: ClassVar[str | None] = None  # None of those that run nowhere else
 
     def __init__(
         self,
         jobs: int | None = None,
         run: RunCell = run_cell,
         keep_models: bool = False,
-        address: str = "local",
+        address: str | None = None,
     ) -> None:
         self._jobs, self._run, self._keep_models = jobs, run, keep_models
-        self._address = address
+        self._address = address or self.default_address
         self._running: dict[Any, Any] = {}
 
     @property
@@ -282,6 +284,7 @@ class OnRay(Executor):
     """A task on one core of a Ray cluster for each job; one whose node is lost runs again."""
 
     local = False
+    default_address = "local"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -356,7 +359,7 @@ def _task(run: RunCell, job: Job, keep_models: bool) -> list[tuple[Any, ...]]:
     return [tuple(outcome) for outcome in run_job(run, job, keep_models, lambda *steps: None)]
 
 
-def _check_reachable(address: str) -> None:
+def _check_reachable(address: Any) -> None:
     """Raise if nothing answers at an address: Ray itself would try for many minutes."""
     host, _, port = address.rpartition(":")
     try:
@@ -382,3 +385,16 @@ EXECUTORS: dict[str, type[Executor]] = {
     "ray": OnRay,
 }
 """The executors by name, as `run_study` and `sme study run` take it."""
+
+
+def executor_type(name: str | None, addresses: Mapping[str, str | None]) -> type[Executor]:
+    """The executor of a name, or the one whose address is given; by default the first."""
+    given = [each for each, address in addresses.items() if address is not None]
+    name = name or next(iter(given), next(iter(EXECUTORS)))
+    choice("executor", name, EXECUTORS, error=UnknownNameError)
+    for other in given:
+        if other != name:
+            raise OptionError(
+                f"{other}={addresses[other]!r}: contradicts executor={name!r}. Leave one out."
+            )
+    return EXECUTORS[name]

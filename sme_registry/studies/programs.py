@@ -51,7 +51,7 @@ from sme_registry.studies.result import (
     failed,
     life_report,
 )
-from sme_registry.training.algorithms import imported, in_jax
+from sme_registry.training.algorithms import backend_of, imported
 from sme_registry.training.record import Snapshots, versions_for
 
 _Report = EvaluationReport | StreamReport
@@ -75,7 +75,7 @@ class Programs:
     ) -> None:
         self.platform, self._device = platform, device
         self._most = most_runs or (_MOST_RUNS if platform == CPU else _MOST_RUNS_ELSEWHERE)
-        self._cells = {cell.digest: cell for cell in cells if in_jax(cell.uses)}
+        self._cells = {cell.digest: cell for cell in cells if backend_of(cell.uses).in_programs}
         self._sizes: dict[Hashable, int] = defaultdict(int)
         for cell in self._cells.values():
             self._sizes[self.group(cell)] += 1

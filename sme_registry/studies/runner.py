@@ -12,17 +12,23 @@ from typing import TYPE_CHECKING, NamedTuple
 from rich.console import Console
 from rich.markup import escape
 
-from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.io import Lock, choice, integer_in
+from sme_registry.errors import OptionError
+from sme_registry.io import Lock, integer_in
 from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.budget import selected, with_sources
 from sme_registry.studies.cell import run_cell
-from sme_registry.studies.executors import EXECUTORS, Executor, RunCell
+from sme_registry.studies.executors import Executor, RunCell, executor_type
 from sme_registry.studies.ledger import Ledger, StudyStatus, label, plan_status
 from sme_registry.studies.result import CPU, CellFailure, CellResult, Job, Outcome
-from sme_registry.training.algorithms import check_algorithm, code_notice, imported, in_jax
+from sme_registry.training.algorithms import (
+    backend_of,
+    check_algorithm,
+    code_notice,
+    imported,
+    needs_device,
+)
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
@@ -33,9 +39,9 @@ def run_study(
     plan_file: StudyFile,
     folder: str | os.PathLike[str],
     *,
-    executor: str | Executor = "processes",
+    executor: str | Executor | None = None,
     jobs: int | None = None,
-    ray: str = "local",
+    ray: str | None = None,
     retry_failed: bool = False,
     keep_models: bool = False,
     only: Sequence[str] = (),
@@ -51,9 +57,10 @@ def run_study(
     continues. Cells that another process is running are waited for. Results of earlier plans stay.
 
     Args:
-      executor: "processes", one for each cell; "in-process"; "ray"; or an `Executor`.
+      executor: "processes", one for each cell; "in-process"; "ray"; an `Executor`; or None for
+        "processes", and with an address the executor of that.
       jobs: cells or programs at once; None for one per core, of this machine or of the cluster.
-      ray: "local", or the address of a Ray cluster.
+      ray: "local", which is the default of executor="ray", or the address of a Ray cluster.
       keep_models: of the cells that run now. Finished cells without a model do not run again.
       only: `class=GLOB`, `algorithm=GLOB`: a cell must match any of the patterns of each kind.
       device: where programs of JAX run, "cpu", "gpu" or "tpu"; None for JAX's default.
@@ -78,9 +85,8 @@ def run_study(
     console = console or err()
     checked = planned.values() if run is run_cell else ()
     _check(plan_file.plan, checked, console if progress else None)
-    if isinstance(executor, str):
-        kind = EXECUTORS[choice("executor", executor, EXECUTORS, error=UnknownNameError)]
-        executor = kind(jobs, run, keep_models, ray)
+    if not isinstance(executor, Executor):
+        executor = executor_type(executor, {"ray": ray})(jobs, run, keep_models, ray)
     programs = _programs(plan_file.plan, checked, device, lanes, local=executor.local)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
@@ -122,18 +128,15 @@ def _programs(
     local: bool,
 ) -> Programs | None:
     """The programs of a plan, if any of these cells runs in one; on a cluster each has one core."""
-    if not any(in_jax(cell.cell.uses) for cell in planned):
+    if not any(backend_of(cell.cell.uses).in_programs for cell in planned):
         for name, value in (("device", device), ("lanes", lanes)):
             if value is not None:
-                raise OptionError(
-                    f"{name}={value!r}: is for agents in JAX, and no cell to run has one. Leave it "
-                    'out, or use --agents jax (in a plan, "uses": "jax:PPO").'
-                )
+                raise needs_device(name, value, ", and no cell to run has one")
         return None
     if not local and device not in (None, CPU):
         raise OptionError(
             f"device={device!r}: must be cpu on a cluster, where a program has one core. Leave out "
-            "--device, or leave out --ray on a machine that has such a device."
+            "--device, or use --executor processes on a machine that has such a device."
         )
     device = device if local else CPU
     module = "sme_registry.studies.programs"
@@ -210,7 +213,7 @@ class Queue:
         for key, place in list(self.waiting.items()):
             if occupied and self._has_the_device(place.cell):
                 continue
-            if self._programs is not None and in_jax(place.cell.uses):
+            if self._programs is not None and backend_of(place.cell.uses).in_programs:
                 job = self._claim_program(self._programs, key)
             else:
                 lock = self._claim(key)
@@ -222,7 +225,8 @@ class Queue:
     def _has_the_device(self, cell: Cell) -> bool:
         """Whether a cell's program has the device to itself."""
         programs = self._programs
-        return programs is not None and programs.one_at_a_time and in_jax(cell.uses)
+        alone = programs is not None and programs.one_at_a_time
+        return alone and backend_of(cell.uses).in_programs
 
     def _claim_program(self, programs: Programs, first: str) -> Job | None:
         """Claim a cell and the others of its program: those of a saved state, or the next ones."""

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from sme_registry.training.learn import Learner, Run
 
 ENTRY_POINTS = "sme_registry.algorithms"
-AGENTS = "sb3", "jax"  # whose implementation of an algorithm is trained
 _PLACES = {  # the modules of algorithms with names of their own
     **dict.fromkeys(("TD3", "SAC", "DDPG", "PPO", "A2C"), "stable_baselines3"),
     **dict.fromkeys(("PPOLagrangian", "PPOProjection"), "sme_registry.sb3"),  # need limits
@@ -81,6 +80,11 @@ class Backend:
       check: a function that raises for a task or stream that it cannot learn for another reason.
       several: whether it learns in several environments at once.
       one_thread: whether PyTorch has one thread meanwhile.
+      title: whose implementation of the same algorithms it is: it is a value of `agents` then.
+      device: a function from the name of a device, or None, to the one that it computes on.
+      in_programs: whether a study runs its cells in shared programs; see `studies.programs`.
+      own_checkpoint: whether only it reads its checkpoints, which are no models.
+      packages: those whose versions its numbers depend on too.
     """
 
     settings: str
@@ -90,6 +94,11 @@ class Backend:
     check: str = ""
     several: bool = False
     one_thread: bool = False
+    title: str = ""
+    device: str = ""
+    in_programs: bool = False
+    own_checkpoint: bool = False
+    packages: tuple[str, ...] = ()
 
 
 _HERE = "sme_registry.training"
@@ -100,6 +109,7 @@ BACKENDS: dict[str, Backend] = {
         learner=f"{_HERE}.models:SB3Learner",
         several=True,
         one_thread=True,
+        title="Stable-Baselines3",
     ),
     "independent": Backend(
         settings=f"{_HERE}.algorithms:independent_settings",
@@ -115,6 +125,11 @@ BACKENDS: dict[str, Backend] = {
         names=("PPO", "TD3", "SAC"),
         check="sme_registry.jax.task:check_supported",
         one_thread=True,
+        title="JAX",
+        device="sme_registry.jax:find_device",
+        in_programs=True,
+        own_checkpoint=True,
+        packages=("jaxlib",),
     ),
     "train": Backend(
         settings=f"{_HERE}.functions:settings",
@@ -132,6 +147,8 @@ BACKENDS: dict[str, Backend] = {
         names=(*POLICIES, *OLD_NAMES),
     ),
 }
+AGENTS = tuple(kind for kind, backend in BACKENDS.items() if backend.title)
+_DEFAULT = AGENTS[0]
 
 
 @dataclass(frozen=True)
@@ -204,8 +221,8 @@ def parse_uses(uses: str) -> tuple[str, str]:
     return "sb3", uses
 
 
-def in_jax(uses: str) -> bool:
-    return parse_uses(uses)[0] == "jax"
+def backend_of(uses: str) -> Backend:
+    return BACKENDS[parse_uses(uses)[0]]
 
 
 def find(uses: str, field: str = "uses") -> Entry:
@@ -215,8 +232,9 @@ def find(uses: str, field: str = "uses") -> Entry:
     for exact in known:
         if exact.casefold() == name.casefold():
             return Entry(kind, exact)
-    if BACKENDS[kind].names:
-        hint = " Other algorithms run without JAX." if kind == "jax" else ""
+    backend = BACKENDS[kind]
+    if backend.names:
+        hint = f" Other algorithms run without {backend.title}." if backend.title else ""
         raise UnknownNameError(
             f"{field}={uses!r}: must be one of {', '.join(f'{kind}:{each}' for each in known)}."
             f"{hint}{did_you_mean(name, known)}"
@@ -231,12 +249,26 @@ def default_algorithm(document: SMESpec | StreamSpec) -> str:
 
 def full_name(uses: str, agents: str | None = None) -> str:
     """The exact name of an algorithm in any case, in the implementation of `agents`, if given."""
+    return find(uses if agents is None else with_agents(uses, agents), "algorithm").uses
+
+
+def with_agents(uses: str, agents: str) -> str:
+    """An algorithm in the implementation of `agents`, if another has it."""
+    choice("agents", agents, AGENTS)
     kind, name = parse_uses(uses)
-    if agents is not None and choice("agents", agents, AGENTS) == "jax":
-        uses = f"jax:{name}"
-    elif agents == "sb3" and kind == "jax":
-        uses = name
-    return find(uses, "algorithm").uses
+    uses = name if kind in AGENTS else uses
+    return uses if agents == _DEFAULT else f"{agents}:{uses}"
+
+
+def needs_device(option: str, value: object, others: str) -> OptionError:
+    """The error for an option of agents on a device, where none is trained."""
+    kinds = [kind for kind, backend in BACKENDS.items() if backend.device]
+    titles = " or ".join(BACKENDS[kind].title for kind in kinds)
+    example = f"{kinds[0]}:{BACKENDS[kinds[0]].names[0]}"
+    return OptionError(
+        f"{option}={value!r}: is for agents in {titles}{others}. Leave it out, or use --agents "
+        f'{" or ".join(kinds)} (in Python, agents="{kinds[0]}"; in a plan, "uses": "{example}").'
+    )
 
 
 def short_name(uses: str) -> str:
@@ -246,7 +278,8 @@ def short_name(uses: str) -> str:
 
 def folder_name(uses: str) -> str:
     """What default folders call an algorithm: its short name, and `jax-PPO` for `jax:PPO`."""
-    return f"{'jax-' * in_jax(uses)}{short_name(uses)}"
+    kind, _ = parse_uses(uses)
+    return f"{kind}-{short_name(uses)}" if kind in AGENTS[1:] else short_name(uses)
 
 
 def code_notice(uses: Iterable[str]) -> str:

@@ -36,7 +36,7 @@ from sme_registry.errors import OptionError
 from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.spec.document import Integer, Real, StrictModel, without_empty
-from sme_registry.training.algorithms import in_jax, parse_uses
+from sme_registry.training.algorithms import BACKENDS, parse_uses
 
 RECORD = "run.json"
 MODEL, MODELS = "model.zip", "model"  # a folder of one model for each independent agent
@@ -54,7 +54,7 @@ def versions_for(uses: str) -> dict[str, str]:
     package = (
         (name if kind in ("independent", "train") else uses).partition(":")[0].partition(".")[0]
     )
-    return versions([*PACKAGES, package, *(["jaxlib"] if in_jax(uses) else [])])
+    return versions([*PACKAGES, package, *BACKENDS[kind].packages])
 
 
 class RunRecord(StrictModel):

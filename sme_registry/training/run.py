@@ -21,7 +21,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from rich.console import Console
 
@@ -62,8 +62,8 @@ from sme_registry.training.algorithms import (
     find,
     full_name,
     imported,
-    in_jax,
     load_algorithm,
+    needs_device,
     nested_hyperparameters,
     quiet,
     short_name,
@@ -136,7 +136,7 @@ def train(
     console: Console | None = None,
     resume: bool = False,
     force: bool = False,
-    agents: Literal["sb3", "jax"] | None = None,
+    agents: str | None = None,
     device: str | None = None,
 ) -> TrainingResult:
     """Train one algorithm on one task or stream: with Stable-Baselines3 on the CPU, or in JAX.
@@ -285,13 +285,10 @@ def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None
 
 
 def _device(entry: Entry, device: str | None) -> str:
-    if in_jax(entry.uses):
-        return str(imported("sme_registry.jax:find_device")(device).platform)
+    if entry.backend.device:
+        return str(imported(entry.backend.device)(device).platform)
     if device is not None:
-        raise OptionError(
-            f"device={device!r}: is for agents in JAX; all others train on the CPU. Leave it out, "
-            'or use --agents jax (in Python, agents="jax").'
-        )
+        raise needs_device("device", device, "; all others train on the CPU")
     return ""
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.spec import SMESpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteFile, catalogue
-from sme_registry.studies.budget import Estimator, scaled, selected, with_agents
+from sme_registry.studies.budget import Estimator, in_implementation, scaled, selected
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.runner import run_study
 from tests import commands
@@ -237,7 +237,7 @@ class TestCommands:
             ("plan smoke --steps many", "--steps 'many': must be N or ALGORITHM=N"),
             ("plan smoke --only class=defalt", "Did you mean 'default'"),
             ("plan smoke --agents torch", "agents='torch': must be 'sb3' or 'jax'"),
-            ("run smoke -f s --ray local --executor processes", "--ray local"),
+            ("run smoke -f s --ray local --executor processes", "ray='local'"),
             ("run smoke -f s --jobs 0", "--jobs"),
             ("run smoke", "--folder"),
             ("run smoke -f s --agents jax --device abacus", "'abacus'"),
@@ -268,7 +268,7 @@ class TestAgents:
     def test_only_what_learns_online_changes_and_names_stay(self):
         bc = {"name": "BC", "uses": "offline:bc", "hyperparameters": {"nu": 0.5}}
         file = small_file(algorithms=["constant", bc, {"name": "slow", "uses": "ppo"}])
-        changed = with_agents(file, "jax")
+        changed = in_implementation(file, "jax")
         assert [(one.name, one.uses) for one in changed.plan.algorithms] == [
             ("constant", "reference:constant"),
             ("BC", "offline:bc"),
@@ -281,10 +281,10 @@ class TestAgents:
             for ours, theirs in zip(changed.plan.cells, file.plan.cells, strict=True)
         ]
         assert same == [True, True, False] * 2
-        assert with_agents(changed, "jax") == changed
-        assert with_agents(file, "sb3") == file
-        assert with_agents(ABLATIONS, "sb3") == ABLATIONS
-        back = with_agents(with_agents(ABLATIONS, "jax"), "sb3")
+        assert in_implementation(changed, "jax") == changed
+        assert in_implementation(file, "sb3") == file
+        assert in_implementation(ABLATIONS, "sb3") == ABLATIONS
+        back = in_implementation(in_implementation(ABLATIONS, "jax"), "sb3")
         assert back.plan == ABLATIONS.plan
 
     @pytest.mark.parametrize("uses", ["A2C", "independent:PPO"])
@@ -295,7 +295,7 @@ class TestAgents:
         fields = {"classes": classes} if "independent" in uses else {}
         file = small_file(algorithms=[{"name": "other", "uses": uses}], **fields)
         with pytest.raises(UnknownNameError, match=f"'other': uses='jax:{uses}'.*jax:PPO"):
-            with_agents(file, "jax")
+            in_implementation(file, "jax")
 
     def test_both_implementations_are_two_algorithms_of_one_plan(self):
         good("new", "both.json", "-t", "Default", "-a", "PPO", "-a", "jax:PPO", "-a", "TD3")

@@ -19,7 +19,7 @@ from sme_registry.studies.report.analysis import (
     Analysis,
 )
 from sme_registry.studies.report.design import METRICS, OUTSIDE, WITHIN
-from sme_registry.training.algorithms import in_jax
+from sme_registry.training.algorithms import AGENTS, BACKENDS, parse_uses
 
 _LABELS = {key: metric.label for key, metric in METRICS.items()}
 _OF_TRAINING = [key for key, metric in METRICS.items() if metric.training]
@@ -294,15 +294,18 @@ def difference_caveats(rows: pd.DataFrame) -> list[str]:
 
 
 def implementation_caveats(plan: StudyPlan, names: Collection[str]) -> list[str]:
-    """A sentence if some of these algorithms run in JAX, and others do not."""
-    algorithms = [algorithm for algorithm in plan.algorithms if algorithm.name in names]
-    ours = [algorithm.name for algorithm in algorithms if in_jax(algorithm.uses)]
-    if len(ours) in (0, len(algorithms)):
-        return []
-    return [
-        f"{conjunction(ours)} {'runs' if len(ours) == 1 else 'run'} in JAX, the other algorithms "
-        "do not: a difference between the two is also one between implementations."
-    ]
+    """A sentence for each implementation that some of these algorithms have, and others not."""
+    kinds = {a.name: parse_uses(a.uses)[0] for a in plan.algorithms if a.name in names}
+    caveats = []
+    for kind in AGENTS[1:]:
+        ours = [name for name, its_kind in kinds.items() if its_kind == kind]
+        if len(ours) not in (0, len(kinds)):
+            caveats.append(
+                f"{conjunction(ours)} {'runs' if len(ours) == 1 else 'run'} in "
+                f"{BACKENDS[kind].title}, the other algorithms do not: a difference between the "
+                "two is also one between implementations."
+            )
+    return caveats
 
 
 def laid_out(layout: Layout, rows: pd.DataFrame, order: Sequence[str] = ()) -> Iterator[TextTable]:

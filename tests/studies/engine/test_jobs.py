@@ -172,7 +172,7 @@ def test_while_another_run_claims_a_program_this_one_waits(tmp_path):
 
 def test_programs_on_ray_run_on_cpus_alone(tmp_path):
     with pytest.raises(
-        OptionError, match=r"device='gpu': must be cpu on a cluster.*leave out --ray"
+        OptionError, match=r"device='gpu': must be cpu on a cluster.*use --executor processes"
     ):
         run_study(plan_file(), tmp_path, executor="ray", device="gpu")
 
