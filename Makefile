@@ -14,7 +14,7 @@ PYTHON ?= $(shell for python in python3 python3.11 python; do \
 	$$python -c '$(NEW_ENOUGH)' >/dev/null 2>&1 && echo $$python && break; done)
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo demo-full serve test check bench lowest docs frameworks clean
+.PHONY: help install demo demo-full serve test check bench lowest docs tutorials frameworks clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -48,10 +48,13 @@ bench: $(INSTALLED)    ## measure speed against peers in the same run
 lowest:          ## run the core's tests with the lowest versions that pyproject.toml allows; before a release
 	PYTHON=$(PYTHON) .ci/lowest
 
-docs: $(INSTALLED)     ## regenerate the generated pages of docs/, run the tutorials, build docs/_build/html
+docs: $(INSTALLED)     ## regenerate the generated pages of docs/, build docs/_build/html
 	$(PY) docs/generate.py
 	$(PY) -m sphinx -q -W --keep-going -j auto $(SPHINX) docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
+
+tutorials: $(INSTALLED)  ## execute the tutorials whose code has changed, and store their outputs
+	$(PY) docs/notebooks.py
 
 frameworks: $(FRAMEWORKS:%=framework-%)  ## run the examples for gymnax, RLlib, sbx and Tianshou, each in an environment of its own
 

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE / "_extensions")]
-# Cells run `sme` and `import sme_registry` as a reader does, and draw without a display.
-os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-os.environ["PYTHONPATH"] = str(HERE.parent)
-os.environ["MPLBACKEND"] = "agg"
-# In the page's own folder, not the reader's: data sets, and the key for boards.
-os.environ["MINARI_DATASETS_PATH"] = "datasets"
-os.environ["XDG_CONFIG_HOME"] = "config"
 
 from sme_registry.version import __version__  # noqa: E402
 
@@ -35,7 +27,6 @@ extensions = [
     "links",
     "python_reference",
     "schema_files",
-    "tutorial_cells",
 ]
 exclude_patterns = [
     "_build", "_extensions", "**/.ipynb_checkpoints",
@@ -47,14 +38,7 @@ myst_enable_extensions = ["colon_fence", "attrs_block"]
 myst_heading_anchors = 4  # headings have the anchors that GitHub gives them
 myst_links_external_new_tab = False
 
-# Tutorials are executed when built; a page whose cells did not change comes from the cache.
-nb_execution_mode = "cache"
-nb_execution_cache_path = str(HERE / "_build" / "executed")
-nb_execution_in_temp = True
-nb_execution_timeout = 600
-nb_execution_raise_on_error = True
-nb_execution_show_tb = True
-nb_merge_streams = True
+nb_execution_mode = "off"  # tutorials have stored outputs: see docs/notebooks.py
 
 highlight_language = "text"  # of blocks without a language
 

@@ -5,10 +5,12 @@
   to any other file a download. A folder cannot be downloaded: its link becomes plain text.
 - A link whose text is a file's name, such as `[teams.md](teams.md)`, has the page's title as its
   text: the site has no such file.
+- A notebook has a link to itself as a file.
 """
 
 from __future__ import annotations
 
+import json
 import posixpath
 import re
 from pathlib import Path
@@ -49,8 +51,23 @@ def front(readme: str) -> str:
     return _FROM_ROOT.sub(lambda link: f"]({'' if link[1] else '../'}{link[2]})", readme)
 
 
+def rewrite_notebook(text: str, name: str, root: Path) -> str:
+    """A notebook with the links of its Markdown made links of the site, and one to its file."""
+    folder, file = posixpath.split(name)
+    notebook = json.loads(text)
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "markdown":
+            cell["source"] = rewrite("".join(cell["source"]), folder, root)
+    download = f"\n\n{{download}}`Download this page as a notebook <{file}.ipynb>`"
+    notebook["cells"][0]["source"] += download
+    return json.dumps(notebook)
+
+
 def _on_read(app: Sphinx, name: str, source: list[str]) -> None:
     root = Path(app.srcdir)
+    if app.env.doc2path(name).suffix == ".ipynb":
+        source[0] = rewrite_notebook(source[0], name, root)
+        return
     if name == app.config.root_doc:
         source[0] = front((root.parent / "README.md").read_text(encoding="utf-8")) + source[0]
     source[0] = rewrite(source[0], posixpath.dirname(name), root)

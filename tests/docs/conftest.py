@@ -8,17 +8,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = {
-    path.stem: text  # the tutorials that are notebooks
-    for path in sorted((ROOT / "docs" / "tutorials").glob("*.md"))
-    if "```python" in (text := path.read_text(encoding="utf-8"))
-}
+TUTORIALS = {path.stem: path for path in sorted((ROOT / "docs" / "tutorials").glob("*.ipynb"))}
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "docs" / "_extensions")]
 
 
 @pytest.fixture(scope="session")
 def site(once):
-    """The folder of the site, built without running the tutorials; a warning is an error."""
+    """The folder of the site; a warning is an error."""
     pytest.importorskip("sphinx")
 
     def build(folder):
@@ -27,9 +23,8 @@ def site(once):
             "import gc; gc.disable(); import sphinx.cmd.build as b; raise SystemExit(b.main())"
         )
         command = [sys.executable, "-c", program, "-q", "-W", "--keep-going", "-j", "2"]
-        options = ["-D", "nb_execution_mode=off", "-d", folder / "doctrees"]
         done = subprocess.run(
-            [*command, *options, ROOT / "docs", folder / "html"],
+            [*command, "-d", folder / "doctrees", ROOT / "docs", folder / "html"],
             capture_output=True,
             text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},

@@ -2,10 +2,9 @@
 
 import importlib
 import inspect
+import json
 import re
 
-import nbclient
-import nbformat
 import pytest
 
 from tests.docs.conftest import ROOT
@@ -17,76 +16,9 @@ import docstrings
 import links
 import python_reference
 import schema_files
-import tutorial_cells
-from docutils import nodes
-from docutils.utils import new_document
 
 import sme_registry
 from sme_registry.cli.show import _SCHEMAS
-
-TUTORIAL = """# Title
-
-<!-- extras: plot, train -->
-
-See [teams](../guides/teams.md) and [a site](https://example.org).
-
-```python
-x = 1
-```
-
-<!-- cell: hide-output -->
-```sh
-sme list
-```
-
-```text
-not run
-```
-"""
-
-
-def test_blocks_of_a_tutorial_are_cells_and_others_stay():
-    page = tutorial_cells.as_page(TUTORIAL, "name")
-    assert "```{code-cell} python3\nx = 1\n```" in page
-    assert "```{code-cell} python3\n:tags: [hide-output]\n%%sh -e\nsme list\n```" in page
-    assert "```text\nnot run\n```" in page
-    assert page.startswith("---\n")
-    assert tutorial_cells.as_page("# No code\n\n```text\n```\n", "name").startswith("# No code")
-
-
-def test_a_tutorial_as_a_notebook_installs_first_and_has_the_same_cells():
-    notebook = tutorial_cells.as_notebook(TUTORIAL)
-    nbformat.validate(notebook)
-    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
-    assert '%pip install --quiet "sme-registry[plot,train] @ {address}"' in code[0]
-    assert code[1:] == ["x = 1", "%%sh -e\nsme list"]
-    text = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
-    assert "See teams and [a site](https://example.org)." in text
-    assert "<!--" not in text
-    assert nbformat.writes(notebook) == nbformat.writes(tutorial_cells.as_notebook(TUTORIAL))
-
-
-def test_long_lines_of_a_shell_stay_whole():
-    class App:
-        def connect(self, *_, **__):
-            pass
-
-    tutorial_cells.setup(App())
-    cell = nbformat.v4.new_code_cell("%%sh\nprintf '%0500d\\n' 7 8")
-    notebook = nbformat.v4.new_notebook(cells=[cell])
-    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
-    (output,) = notebook.cells[0].outputs
-    assert output.text == f"{7:0500}\n{8:0500}\n"
-
-
-def test_shell_cells_are_shown_as_they_are_typed_in_a_terminal():
-    code = [nodes.literal_block(text, text) for text in ("%%sh -e\nsme list", "x = '%%sh -e'")]
-    page = new_document("page")
-    page += code
-    tutorial_cells._on_doctree(None, page)
-    shell, python = page.children
-    assert (shell.astext(), shell["language"]) == ("sme list", "sh")
-    assert python is code[1]
 
 
 def test_links_out_of_docs_lead_to_pages_of_the_site_or_nowhere():
@@ -100,6 +32,21 @@ def test_links_out_of_docs_lead_to_pages_of_the_site_or_nowhere():
     same = "[ope](../../examples/ope.py), ![x](../../x.png), [m](../explanation/method.md)"
     assert rewritten(same) == same
     assert rewritten("[teams.md](teams.md#a) says") == "[](teams.md#a) says"
+
+
+def test_a_notebook_has_links_of_the_site_and_one_to_its_file():
+    link = "[i](../../README.md#install) [m](../explanation/method.md)"
+    cells = [
+        {"cell_type": "markdown", "source": ["# Title\n", link]},
+        {"cell_type": "code", "source": link},
+    ]
+    text = json.dumps({"cells": cells})
+    page = json.loads(links.rewrite_notebook(text, "tutorials/a", ROOT / "docs"))
+    assert [cell["source"] for cell in page["cells"]] == [
+        "# Title\n[i](../index.md#install) [m](../explanation/method.md)\n\n"
+        "{download}`Download this page as a notebook <a.ipynb>`",
+        link,
+    ]
 
 
 def test_the_front_page_is_the_readme_with_its_links_from_docs():

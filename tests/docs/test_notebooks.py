@@ -1,5 +1,6 @@
-"""The tutorials as notebooks: valid, and installed and executed as a reader does it."""
+"""The tutorials: with the outputs of their code, and installed and executed as a reader does it."""
 
+import copy
 import importlib.util
 import json
 import os
@@ -13,12 +14,13 @@ import venv
 
 import pytest
 
-from tests.docs.conftest import PAGES, ROOT
+from tests.docs.conftest import ROOT, TUTORIALS
 
 pytest.importorskip("sphinx")
+pytest.importorskip("PIL")
 
 import nbformat
-import tutorial_cells
+import notebooks
 from IPython.core.inputtransformer2 import TransformerManager
 from packaging.requirements import Requirement
 
@@ -30,28 +32,48 @@ nbformat.write(notebook, sys.argv[1])
 """
 
 
-def install_cell(name):
-    return tutorial_cells.as_notebook(PAGES[name]).cells[1].source
+def read(name):
+    return nbformat.read(TUTORIALS[name], as_version=4)
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_a_tutorial_is_a_valid_notebook_with_every_block_of_its_page(name):
-    notebook = tutorial_cells.as_notebook(PAGES[name])
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_a_tutorial_has_the_outputs_of_its_code_and_nothing_of_the_machine(name):
+    notebook, text = read(name), TUTORIALS[name].read_text(encoding="utf-8")
     nbformat.validate(notebook)
-    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
-    blocks = re.findall(r"^```(?:python|sh)\n(.*?)^```", PAGES[name], re.M | re.S)
-    assert [source.removeprefix("%%sh -e\n") for source in code[1:]] == [b.rstrip() for b in blocks]
-    for source in code:
-        compile(TransformerManager().transform_cell(source), name, "exec")
+    assert notebooks.is_current(notebook), f"run `python docs/notebooks.py {name}`"
+    assert len(text.encode()) < 300_000
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert {output.output_type for output in outputs}.isdisjoint({"error"})
+    for output in outputs:
+        shown = json.dumps({k: v for k, v in output.get("data", {}).items() if k != "image/png"})
+        assert not re.search(
+            r"/(tmp|home|root|work|Users)/|\x1b|\r", shown + output.get("text", "")
+        )
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_the_extras_of_a_tutorial_exist_and_its_text_names_them(name):
+def test_outputs_are_not_those_of_the_code_if_a_cell_has_changed_or_an_output_is_missing():
+    notebook = read("first_agent")
+    without, other, prose = (copy.deepcopy(notebook) for _ in range(3))
+    code = [cell for cell in without.cells if cell.get("outputs")]
+    code[-1].outputs = []
+    other.cells[-2].source += " "
+    assert other.cells[-2].cell_type == "code"
+    prose.cells[0].source += "."
+    current = map(notebooks.is_current, (notebook, prose, without, other))
+    assert list(current) == [True, True, False, False]
+
+
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_a_tutorial_installs_first_what_its_text_names(name):
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    (extras,) = re.findall(r"^<!-- extras: (.*?) -->$", PAGES[name], re.M)
+    title, install = read(name).cells[:2]
+    (extras,) = re.findall(r'"sme-registry\[(.*?)\] @ \{address\}"', install.source)
     assert set(extras.split(",")) <= set(known["optional-dependencies"])
-    assert all(f"`{extra}`" in PAGES[name] for extra in extras.split(","))
-    assert "](../../README.md#install)" in PAGES[name]
+    assert all(f"`{extra}`" in title.source for extra in extras.split(","))
+    assert install.source.replace(extras, "") == read("teams").cells[1].source.replace(
+        "fast,plot,train", ""
+    )
 
 
 def requirement(source, monkeypatch, tmp_path):
@@ -66,7 +88,7 @@ def requirement(source, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", os.environ["PATH"])
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    cell = install_cell("first_agent").replace('"sme-registry"\n', f"{source!r}\n", 1)
+    cell = read("first_agent").cells[1].source.replace('"sme-registry"\n', f"{source!r}\n", 1)
     exec(TransformerManager().transform_cell(cell), namespace)
     return Requirement(shlex.split(commands[0])[-1])
 
@@ -84,13 +106,8 @@ def test_the_first_cell_installs_from_a_git_address(monkeypatch, tmp_path):
     assert requirement(address, monkeypatch, tmp_path).url == address
 
 
-def test_the_first_cell_also_installs_what_no_extra_has():
-    assert install_cell("teams").count("%pip install --quiet torchrl\n") == 1
-    assert "torchrl" not in install_cell("first_agent")
-
-
-def test_a_source_that_does_not_exist_is_refused_with_what_to_do(monkeypatch, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.whl is missing: set SOURCE"):
+def test_a_source_that_does_not_exist_is_refused_with_its_path(monkeypatch, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.whl"):
         requirement("none.whl", monkeypatch, tmp_path)
 
 
@@ -106,9 +123,10 @@ def test_a_notebook_installs_the_wheel_and_runs_in_a_fresh_environment(tmp_path)
     # The dependencies of this environment without the package: nested path files are not read.
     (packages / "dependencies.pth").write_text("\n".join(site.getsitepackages()))
 
-    notebook = tutorial_cells.as_notebook(PAGES["first_agent"].replace("= 20_000", "= 1_024"))
-    install = notebook.cells[1]
-    install.source = install.source.replace('"sme-registry"\n', f"{str(wheel)!r}\n", 1)
+    notebook = read("first_agent")
+    for cell in notebook.cells:
+        cell.source = cell.source.replace("STEPS = 20_000", "STEPS = 1_024")
+        cell.source = cell.source.replace('"sme-registry"\n', f"{str(wheel)!r}\n", 1)
     file = tmp_path / "first_agent.ipynb"
     nbformat.write(notebook, file)
     outside = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "MPLBACKEND")}

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from tests.browser import needs_chromium, serving_files
-from tests.docs.conftest import PAGES, ROOT
+from tests.docs.conftest import ROOT, TUTORIALS
 
 WIDTHS = {"phone": 400, "desktop": 1280}
 SAMPLE = (
@@ -48,20 +48,22 @@ def test_no_page_loads_anything_from_another_host(site):
 
 def test_every_page_of_the_sources_is_in_the_site(site):
     hidden = {"_build", "_extensions", "python", "codes.md"}
-    sources = [p.relative_to(ROOT / "docs") for p in (ROOT / "docs").rglob("*.md")]
+    files = [p for ending in ("md", "ipynb") for p in (ROOT / "docs").rglob(f"*.{ending}")]
+    sources = [p.relative_to(ROOT / "docs") for p in files]
     pages = [p for p in sources if not hidden.intersection(p.parts)]
     assert len(pages) > 40
     assert [p for p in pages if not (site / p).with_suffix(".html").exists()] == []
 
 
-def test_a_schema_is_a_file_and_a_tutorial_a_notebook(site):
+def test_a_schema_is_a_file_and_a_tutorial_a_notebook_with_its_figures(site):
     schema = json.loads((site / "schemas" / "SMESpec.schema.json").read_text())
     assert schema["properties"]["k"]["minimum"] == 1
-    for name in PAGES:
-        notebook = json.loads((site / "notebooks" / f"{name}.ipynb").read_text())
-        assert notebook["nbformat"] == 4
+    for name, source in TUTORIALS.items():
         page = (site / "tutorials" / f"{name}.html").read_text()
-        assert f'href="../notebooks/{name}.ipynb" download' in page
+        (link,) = re.findall(rf'href="(\.\./_downloads/\w+/{name}\.ipynb)"', page)
+        assert (site / "tutorials" / link).read_bytes() == source.read_bytes()
+        figures = source.read_text(encoding="utf-8").count('"image/png"')
+        assert len(re.findall(r'<img [^>]*src="\.\./_images/', page)) == figures
 
 
 def test_names_and_commands_in_code_lead_to_their_reference(site):
