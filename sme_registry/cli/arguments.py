@@ -35,7 +35,8 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.catalogue import Envelope, is_path, resolve
+from sme_registry.spec.catalogue import is_path, resolve
+from sme_registry.spec.files import Envelope
 
 TaskName = Annotated[
     str,

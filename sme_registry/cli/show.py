@@ -31,7 +31,8 @@ from sme_registry.spec import (
     cards,
     catalogue,
 )
-from sme_registry.spec.catalogue import Envelope, known
+from sme_registry.spec.catalogue import known
+from sme_registry.spec.files import Envelope
 from sme_registry.spec.suite import EvaluationProtocol
 
 app = typer.Typer()

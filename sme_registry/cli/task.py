@@ -44,8 +44,9 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.catalogue import Envelope, is_path
+from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.document import Document
+from sme_registry.spec.files import Envelope
 from sme_registry.spec.study import sweep
 from sme_registry.task import load
 from sme_registry.task.certificate import MARKS, Certificate, certify, short

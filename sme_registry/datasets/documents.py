@@ -30,6 +30,7 @@ from pydantic import Field, model_validator
 from sme_registry.errors import PolicyError, SpecError, UnknownNameError
 from sme_registry.io import choice, sha256_of
 from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec.blocks import Seed
 from sme_registry.spec.document import (
     Digest,
     DigestedFile,
@@ -43,7 +44,6 @@ from sme_registry.spec.document import (
     plain_number,
     short_repr,
 )
-from sme_registry.spec.sme_spec import Seed
 
 KEY = "sme"  # of the record in Minari's metadata
 _TOLERANCE = 1e-9  # of the sum of weights: ten times 0.1 is not 1 in floating point

@@ -18,7 +18,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from sme_registry.envs import arguments
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.catalogue import DYNAMICS_VERSION, NAMESPACE, Resolved, content_id, resolve
+from sme_registry.spec.catalogue import DYNAMICS_VERSION, NAMESPACE, content_id, resolve
+from sme_registry.spec.files import Resolved
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task

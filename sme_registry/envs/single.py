@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.envs import arguments
-from sme_registry.envs.batch import StepNumbers
+from sme_registry.envs.random import StepNumbers
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
 from sme_registry.envs.schedule import GymnasiumMixin, Schedule
 from sme_registry.errors import EpisodeError

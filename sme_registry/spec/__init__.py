@@ -1,16 +1,15 @@
 """Documents: specs, suites, protocols and plans, frozen and hashed, and their files."""
 
-from sme_registry.spec.catalogue import EnvFile, ProtocolFile, StreamFile, StudyFile, SuiteFile
-from sme_registry.spec.sme_spec import (
+from sme_registry.spec.blocks import (
     AgentSpec,
     NoiseSpec,
     ObservationSpec,
     SafetySpec,
-    Setting,
     ShapingSpec,
-    SMESpec,
     TeamSpec,
 )
+from sme_registry.spec.files import EnvFile, ProtocolFile, StreamFile, StudyFile, SuiteFile
+from sme_registry.spec.sme_spec import Setting, SMESpec
 from sme_registry.spec.stream import Drift, Phase, StreamSpec
 from sme_registry.spec.study import StudyAlgorithm, StudyPlan
 from sme_registry.spec.suite import EvaluationProtocol, StreamClass, Suite, SuiteClass

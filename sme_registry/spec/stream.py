@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from sme_registry.errors import SpecError
 from sme_registry.io import integer_in
+from sme_registry.spec.blocks import MAX_SEED
 from sme_registry.spec.document import (
     Digest,
     Integer,
@@ -26,7 +27,7 @@ from sme_registry.spec.document import (
     StrictModel,
     find_named,
 )
-from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, Segment, SegmentTimes, SMESpec
+from sme_registry.spec.sme_spec import FULL_TURN, Segment, SegmentTimes, SMESpec
 
 MAX_SEGMENTS = 10_000  # of one cycle
 MAX_VISITS = 1_000  # of a life that is evaluated

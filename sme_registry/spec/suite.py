@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 from pydantic import BeforeValidator, Field, model_validator
 
 from sme_registry.errors import SpecError
+from sme_registry.spec.blocks import Seed
 from sme_registry.spec.document import (
     Document,
     Integer,
@@ -25,7 +26,7 @@ from sme_registry.spec.document import (
     find_named,
     short_repr,
 )
-from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
+from sme_registry.spec.sme_spec import Setting, SMESpec
 from sme_registry.spec.stream import StreamSpec
 
 

@@ -19,8 +19,9 @@ import numpy as np
 from sme_registry.errors import FingerprintMismatchError, OptionError, ResourceLimitError, SMEError
 from sme_registry.io import check_new
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.catalogue import Fingerprint, as_document, file_of, resolve
+from sme_registry.spec.catalogue import as_document, file_of, resolve
 from sme_registry.spec.document import NamedDocument
+from sme_registry.spec.files import Fingerprint
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import draw
 from sme_registry.task.task import Task

@@ -26,7 +26,7 @@ import sme_registry
 from sme_registry import SMESpec, testing
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.spec import catalogue
-from sme_registry.spec.catalogue import EnvFile
+from sme_registry.spec.files import EnvFile
 from sme_registry.testing import expect_same, next_action, play
 
 NAMES = [file.versioned_name for file in catalogue.entries(EnvFile) if file.spec.team is None]

@@ -25,7 +25,8 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.catalogue import Resolved, resolve
+from sme_registry.spec.catalogue import resolve
+from sme_registry.spec.files import Resolved
 from sme_registry.task import materialize
 
 ENVS, SUITES = catalogue.entries(EnvFile), catalogue.entries(SuiteFile)

@@ -15,7 +15,7 @@ from sme_registry.errors import (
     SpecError,
 )
 from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
-from sme_registry.spec.catalogue import Fingerprint
+from sme_registry.spec.files import Fingerprint
 from sme_registry.task import load, materialize
 from sme_registry.task.loading import _draw_cached, check_fingerprint, fingerprint_of, load_task
 from tests.strategies import specs
