@@ -177,6 +177,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
             self.action_spaces[name], self._rescaled = arguments.action_space(action_range, width)
             observed = gymnasium.spaces.Box(0.0, 1.0, (len(part),), np.float32)
             self.observation_spaces[name] = observed
+        self._range_warning = arguments.RangeWarning(self.sme_spec, self._rescaled)
         self._allocate()
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
 
@@ -270,6 +271,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         if self._begun and not self.agents and isinstance(actions, dict) and not actions:
             return {}, {}, {}, {}, {}
         joint = self._joint(actions)
+        if self._range_warning.is_due():
+            self._range_warning.check(joint)
         try:
             result = self._batch.advance(joint)
         except ActionError as error:

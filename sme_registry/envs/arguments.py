@@ -25,6 +25,7 @@ from sme_registry.errors import (
 )
 from sme_registry.io import choice, integer_in
 from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.spec.catalogue import NAMESPACE, symmetric_name, unique_name
 from sme_registry.spec.sme_spec import ACTION_RANGES, SpecLike
 from sme_registry.task import Task
 from sme_registry.task.loading import load_task
@@ -119,6 +120,32 @@ def to_unit(
         array += 1.0
         array /= 2.0
     return array
+
+
+class RangeWarning:
+    """Warns once of actions far below 0 in the unit range, those of an actor with tanh outputs."""
+
+    # Noise added to an action at the boundary seldom goes further.
+    FAR_BELOW, EVERY = -0.1, 32
+
+    def __init__(self, document: SMESpec | StreamSpec, rescaled: bool) -> None:
+        self._document, self._is_over, self._wait = document, rescaled, 0
+
+    def is_due(self) -> bool:
+        """True once in 32 calls, the first included: a check costs as much as a step."""
+        self._wait = (self._wait + 1) % self.EVERY
+        return self._wait == 1 and not self._is_over
+
+    def check(self, actions: Array) -> None:
+        if not (actions < self.FAR_BELOW).any():
+            return
+        self._is_over = True
+        symmetric = f"{NAMESPACE}/{symmetric_name(unique_name(self._document))}"
+        id_too = f', or make "{symmetric}"' if symmetric in gymnasium.registry else ""
+        gymnasium.logger.warn(
+            f"actions below 0 are clipped to 0, as the action range is [0, 1]. If your actor's are "
+            f'in [-1, 1], such as those of tanh, use action_range="symmetric"{id_too}.'
+        )
 
 
 def from_unit(unit: npt.NDArray[Any], rescaled: bool) -> npt.NDArray[Any]:

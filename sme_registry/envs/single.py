@@ -44,7 +44,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     """One episode at a time of a task, or of a stream of tasks, whose optimal policy is known.
 
     Observation: `[S + 2]` float32 in [0, 1]: the state, t/T, and r_cum/k. Action: `[A]`, in [0, 1]
-    (`action_range="unit"`) or [−1, 1] (`"symmetric"`, rescaled); actions outside are clipped.
+    (`action_range="unit"`) or [−1, 1] (`"symmetric"`, rescaled); actions outside are clipped, with
+    one warning where unit ones are far below 0.
 
     `info` of each step, about the state acted in: `optimal_action` `[A]`, in the environment's
     action range; `similarity` r̃, `step_reward` r and `regret` 1 − r, each in [0, 1]; and
@@ -93,6 +94,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self._parts = [(key, slice(i * A, (i + 1) * A)) for i, key in actions]
         space, self._rescaled = arguments.action_space(action_range, A)
         self.action_space = cast("gymnasium.Space[Action]", space)
+        self._range_warning = arguments.RangeWarning(document, self._rescaled)
         width = document.observation_dim
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self._status = "not begun"
@@ -263,7 +265,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             try:
                 optimal, observation = next_rows()
             except IndexError:
-                env._refill()
+                env._refill(action)
                 optimal, observation = next_rows()
             try:
                 plain = action.dtype is no_checks and action.ndim == 1
@@ -320,8 +322,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self._status, self._step = "ended", _check_running
         return cast(float, waiting)
 
-    def _refill(self) -> None:
+    def _refill(self, action: Any) -> None:
         """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
+        if self._range_warning.is_due():
+            self._range_warning.check(self._checked(action))
         width = self.document.observation_dim
         numbers = self._action_shape[0] * len(self._parts)
         count = max(1, _POOL_BYTES // (8 * max(width, numbers)))

@@ -116,6 +116,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         A, width = self.document.action_dim, self._batch.observation_dim
         self.single_action_space, self._rescaled = arguments.action_space(action_range, A)
         self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
+        self._range_warning = arguments.RangeWarning(self.document, self._rescaled)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._renderer = batch_renderer(render_mode, render_lanes, self._batch, self._rescaled)
@@ -215,6 +216,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         # In mode NEXT_STEP the actions of environments that have ended are ignored.
         resting = ended_before if any_ended_before else None
         unit_actions = arguments.to_unit(actions, (B, A), self._rescaled, ignored=resting)
+        if self._range_warning.is_due():
+            self._range_warning.check(unit_actions)
 
         result = self._batch.advance(unit_actions, resting)
         observation, reward = result.observation, result.values[REWARD, 0]

@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import re
+import warnings
 
 import gymnasium
 import numpy as np
@@ -124,6 +126,38 @@ def test_the_symmetric_range_is_the_same_task_rescaled_and_both_are_clipped():
     beyond, within = copy.deepcopy(unit), unit
     assert beyond.step(np.full(4, -7.0))[1] == within.step(np.zeros(4))[1]
     np.testing.assert_array_equal(beyond.state, within.state)
+
+
+def test_actions_far_below_the_unit_range_are_announced_once():
+    far, near = np.full(4, -0.5, np.float32), np.full(4, -0.09, np.float32)
+    envs = gymnasium.make_vec("SME/Default-v1", 2)
+    team = sme_registry.make_parallel("Team2")
+    names = team.possible_agents
+    steps = {
+        r'"symmetric", or make "SME/DefaultSymmetric-v1"': (SMEEnv("Default"), lambda a: a),
+        "SME/DefaultSymmetric-v1": (envs, lambda a: np.array([a, a])),
+        r'action_range="symmetric"\.': (
+            team,
+            lambda a: {n: a[: team.action_space(n).shape[0]] for n in names},
+        ),
+    }
+    for remedy, (env, form) in steps.items():
+        env.reset(seed=0)
+        env.step(form(near))
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            for t in range(2000):
+                ended = (team is env and not env.agents) or (
+                    isinstance(env, SMEEnv) and t % 100 == 99
+                )
+                if ended:
+                    env.reset()
+                env.step(form(far))
+        assert len(seen) == 1
+        assert re.search(remedy, str(seen[0].message))
+    symmetric = SMEEnv("Default", action_range="symmetric")
+    symmetric.reset(seed=0)
+    symmetric.step(far)
 
 
 def test_an_action_is_the_same_in_whatever_form_it_comes():
