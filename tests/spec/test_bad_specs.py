@@ -28,7 +28,10 @@ BAD = [
     ({"k": DEEP}, ["k=[[[", "must be a valid integer"]),
     ({"D": np.float32("nan")}, ["D=nan: must be a finite number"]),
     ({"policy_init": "unit"}, ["policy_init='unit': must be 'semi_orthogonal' or 'unit_variance'"]),
-    ({"schema_version": 2}, ["schema_version=2: must be 1. Correct it, or leave it out"]),
+    (
+        {"schema_version": 2},
+        ["schema_version=2: a newer version wrote it. Upgrade: pip install --upgrade"],
+    ),
     ({"seed": -1}, ["seed=-1: must be an integer in [0, 9007199254740992)"]),
     ({"seed": "7"}, ["seed='7': must be", "0x"]),
     ({"seed": "0xg"}, ["seed='0xg': must be"]),

@@ -39,7 +39,7 @@ def changed(path, **fields):
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15)
 @given(spec=specs())
 def test_a_spec_survives_its_file(spec, tmp_path):
-    path = sme_registry.save(spec, tmp_path / "task.json")
+    path = sme_registry.save(spec, tmp_path / "task.json", force=True)
     loaded = sme_registry.load(path)  # checks the fingerprint
     assert loaded == spec
     assert loaded.digest == spec.digest
@@ -200,10 +200,14 @@ def test_saving_under_a_bad_name_writes_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "task").mkdir()
     with pytest.raises(OptionError, match="cannot be written"):
-        sme_registry.save(SMESpec(), tmp_path / "task")
+        sme_registry.save(SMESpec(), tmp_path / "task", force=True)
 
 
-def test_saving_again_replaces_the_file_whole(saved):
-    sme_registry.save(SMESpec(seed=9), saved)
+def test_only_force_replaces_the_file_of_another_task_and_whole(saved):
+    before = saved.read_bytes()
+    with pytest.raises(OptionError, match="already exists"):
+        sme_registry.save(SMESpec(seed=9), saved)
+    assert saved.read_bytes() == before
+    sme_registry.save(SMESpec(seed=9), saved, force=True)
     assert sme_registry.load(saved) == SMESpec(seed=9)
     assert [child.name for child in saved.parent.iterdir()] == ["mine.json"]

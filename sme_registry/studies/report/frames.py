@@ -33,11 +33,12 @@ Columns of the run, repeated in each of its regions; NaN or NA where the run has
     seconds, steps_per_second    CPU time of the run, and training speed
     key                          digest of the run's cell, which names its file
 
-With safety: tightness τ of the limits; online_cost, the mean over training; wd_cost and
-wd_safe_regret, of the cube; cost, violating_share, safe_regret and price_of_safety, of the region.
-With observation: its fields distractors, dynamics, mixing, mixing_depth; distractor_regret, the
-mean over the shells of d; wd_sensitivity, of the cube; sensitivity, of the region. The numbers of a
-team are means over agents or channels. Those of each agent have its name, in `results`
+With shaping: its scale and discount; with noise: its reward and transition. With safety: tightness
+τ of the limits, and compensated; online_cost, the mean over training; wd_cost and wd_safe_regret,
+of the cube; cost, violating_share, safe_regret and price_of_safety, of the region. With
+observation: its fields distractors, dynamics, mixing, mixing_depth; distractor_regret, the mean
+over the shells of d; wd_sensitivity, of the cube; sensitivity, of the region. The numbers of a team
+are means over agents or channels. Those of each agent have its name, in `results`
 normalised_regret/agent_0 of the region, and wd_regret, ood_regret and online_regret of the run, and
 in `curves` regret/agent_0.
 
@@ -122,12 +123,13 @@ def _block_columns(block: str) -> str:
     """The fields of a block, of which runs without it have none."""
     fields = fields_of_block(block).items()
     return " ".join(
-        f"{name}:{_OPTIONAL.get(number_type(field), 'string')}" for name, field in fields
+        f"{name}:{_OPTIONAL.get(number_type(field) or field.annotation, 'string')}"
+        for name, field in fields
     )
 
 
 _DTYPES: dict[type | None, str] = {int: "int64", float: "float64"}
-_OPTIONAL: dict[type | None, str] = {int: "Int64", float: "float64"}
+_OPTIONAL: dict[type | None, str] = {int: "Int64", float: "float64", bool: "boolean"}
 _MEASURED = [name for name in RegionReport.model_fields if name not in ("name", "channels")]
 _REGION = f"""region:str {" ".join(_MEASURED).replace("states", "states:int64")}
     linear_normalised_regret best_constant_normalised_regret random_normalised_regret
@@ -314,7 +316,7 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
     }
     for block in _OF_TASKS:
         fields = getattr(cell.spec, block)
-        columns |= {} if fields is None else fields.to_dict()
+        columns |= {} if fields is None else fields.every_field()
     for name, agent in report.agents.items():
         wd, *shells = (region.normalised_regret for region in agent.regions)
         columns |= {

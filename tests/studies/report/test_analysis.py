@@ -107,7 +107,7 @@ def test_a_contrast_pairs_runs_of_equal_number(study):
     assert row.change == pytest.approx(statistics.iqm([after[i] - before[i] for i in range(3)]))
     assert row.base == pytest.approx(statistics.iqm([before[i] for i in range(3)]))
     assert not row.enough_pairs
-    assert row.verdict == "worse"
+    assert row.verdict == "indication"
 
 
 def test_contrasts_find_the_axis_that_each_learner_is_sensitive_to(study):

@@ -91,6 +91,7 @@ def test_rows_have_the_numbers_of_their_reports(study):
     assert rows[rows.class_name == "safe"].cost.max() > 0
     of_class = runs.drop_duplicates("class_name").set_index("class_name")
     assert of_class.tightness.dropna().to_dict() == {"safe": 0.4}
+    assert of_class.compensated.dropna().to_dict() == {"safe": False}
     assert of_class.distractors.dropna().to_dict() == {"driven": 3, "mixed": 0}
     assert of_class.dynamics.dropna().to_dict() == {"driven": "driven"}
     assert of_class.mixing.dropna().to_dict() == {"driven": "none", "mixed": "nonlinear"}
@@ -106,8 +107,8 @@ def test_plans_without_limits_and_observations_have_no_such_columns(study):
         file, results = only(study, name)
         columns[name] = set(study_frames(file.plan, results).results)
     assert columns["safe"] - columns["plain"] == {
-        "tightness", "online_cost", "wd_cost", "wd_safe_regret", "cost", "violating_share",
-        "safe_regret", "price_of_safety",
+        "tightness", "compensated", "online_cost", "wd_cost", "wd_safe_regret", "cost",
+        "violating_share", "safe_regret", "price_of_safety",
     }  # fmt: skip
     assert columns["driven"] - columns["plain"] == {
         "distractors", "dynamics", "mixing", "mixing_depth", "distractor_regret", "sensitivity",
