@@ -129,7 +129,7 @@ def _block_columns(block: str) -> str:
 
 
 _DTYPES: dict[type | None, str] = {int: "int64", float: "float64"}
-_OPTIONAL: dict[type | None, str] = {int: "Int64", float: "float64", bool: "boolean"}
+_OPTIONAL: dict[Any, str] = {int: "Int64", float: "float64", bool: "boolean"}
 _MEASURED = [name for name in RegionReport.model_fields if name not in ("name", "channels")]
 _REGION = f"""region:str {" ".join(_MEASURED).replace("states", "states:int64")}
     linear_normalised_regret best_constant_normalised_regret random_normalised_regret
