@@ -5,13 +5,14 @@ import re
 import runpy
 import shlex
 import subprocess
+from glob import glob
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from sme_registry import load
-from sme_registry.spec import ObservationSpec, SafetySpec, SMESpec
+from sme_registry.spec import NoiseSpec, ObservationSpec, SafetySpec, ShapingSpec, SMESpec
 from sme_registry.studies.executors import InProcess, Processes
 from sme_registry.task.certificate import certify
 
@@ -27,17 +28,48 @@ def cells(tutorial, kind):
 
 
 @pytest.mark.parametrize(
-    "page",
+    ("name", "shorter"),
     [
-        *(
-            f"docs/guides/{name}.md"
-            for name in (
-                "specs", "streams", "teams", "training", "datasets", "studies",
-                "retention", "safety_and_observation",
-            )
+        ("tasks", {}),
+        (
+            "streams",
+            {
+                "20_000": "100",
+                "-a PPO --out": "--set n_steps=100 --set batch_size=50 -a PPO --out",
+                "train Switch5": "train mine.json",
+                "visit-*.zip Switch5": "visit-*.zip mine.json",
+            },
         ),
+        ("teams", {"--steps 40000": "-n 64 --num-envs 2 --set n_steps=64"}),
+        ("safety_and_observation", {"-n 20000": "-n 64 --set n_steps=64"}),
+        ("offline", {"--transitions 50000": "-n 1000 --protocol quick-v1", "-n 20000": "-n 20"}),
     ],
-)  # fmt: skip
+)
+def test_a_guide_works_from_top_to_bottom(name, shorter, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    page = (ROOT / "docs" / "guides" / f"{name}.md").read_text()
+    work_through(page, shorter)
+
+
+def work_through(page, shorter):
+    """Run a page's Python and commands in order, with some of its text replaced."""
+    for full, short in shorter.items():
+        assert full in page
+        page = page.replace(full, short)
+    namespace = {"__name__": "page"}
+    for language, block in re.findall(r"^```(python|sh)\n(.*?)^```", page, re.M | re.S):
+        if language == "python":
+            exec(compile(block, "page", "exec"), namespace)
+        else:
+            for line in block.replace("\\\n", "").splitlines():
+                run(*line.split(maxsplit=1))
+
+
+@pytest.mark.parametrize(
+    "page",
+    [f"docs/guides/{name}.md" for name in ("training", "studies")],
+)
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.M | re.S)
@@ -136,7 +168,10 @@ def run(program, command):
     from leaderboard.cli import app as leaderboard
     from sme_registry.cli import app as sme
 
-    arguments = shlex.split(command)
+    words = shlex.split(command, comments=True)
+    arguments = [path for word in words for path in sorted(glob(word)) or [word]]
+    short = ["--protocol", "quick-v1"] if arguments[0] in ("train", "evaluate") else []
+    arguments += [] if "--protocol" in arguments or "--data" in arguments else short
     key = ["--key", "my.key"] if arguments[0] == "submit" else []
     key = key if program == "sme-leaderboard" else []
     result = CliRunner().invoke(sme if program == "sme" else leaderboard, [*arguments, *key])
@@ -170,11 +205,11 @@ def test_the_example_of_the_readme_prints_what_stands_below_it(capsys):
 
 
 def test_the_table_of_fields_has_every_field_its_default_and_its_meaning():
-    table = re.findall(r"^\| `(\w+)` \| .* \| (.*?) \| (.*?) \|$", specs_page(), re.M)
+    table = re.findall(r"^\| `(\w+)` \| .* \| (.*?) \| (.*?) \|$", tasks_page(), re.M)
     fields = {
         name: field
         for name, field in SMESpec.model_fields.items()
-        if name not in ("schema_version", "team", "safety", "observation")
+        if name not in ("schema_version", "team", "safety", "observation", "shaping", "noise")
     }
     assert {name: number(default.strip("`")) for name, default, _ in table} == {
         name: number(str(field.default)) for name, field in fields.items()
@@ -183,10 +218,15 @@ def test_the_table_of_fields_has_every_field_its_default_and_its_meaning():
         assert f"{meaning.partition(';')[0]}." == fields[name].description
 
 
-def test_the_table_of_safety_and_observation_has_every_field():
-    page = (ROOT / "docs" / "guides" / "safety_and_observation.md").read_text()
-    documented = re.findall(r"^\| `((?:safety|observation)\.\w+)` \|", page, re.M)
-    kinds = {"safety": SafetySpec, "observation": ObservationSpec}
+def test_the_tables_of_blocks_have_every_field():
+    safety = (ROOT / "docs" / "guides" / "safety_and_observation.md").read_text()
+    documented = re.findall(r"^\| `(\w+\.\w+)` \|", tasks_page() + safety, re.M)
+    kinds = {
+        "shaping": ShapingSpec,
+        "noise": NoiseSpec,
+        "safety": SafetySpec,
+        "observation": ObservationSpec,
+    }
     fields = [f"{name}.{field}" for name, kind in kinds.items() for field in kind.model_fields]
     assert documented == fields
 
@@ -208,8 +248,8 @@ def test_the_checks_of_the_page_are_those_of_a_certificate(tmp_path):
         assert float(value) == pytest.approx(checks[name].value, rel=0.05)
 
 
-def specs_page():
-    return (ROOT / "docs" / "guides" / "specs.md").read_text()
+def tasks_page():
+    return (ROOT / "docs" / "guides" / "tasks.md").read_text()
 
 
 def number(text):

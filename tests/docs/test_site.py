@@ -132,8 +132,8 @@ def test_search_finds_a_word_and_leads_to_its_page(opened):
     page = opened("index")
     page.get_by_role("textbox", name="Search").fill("plasticity")
     page.keyboard.press("Enter")
-    page.locator("ul.search li a", has_text="What an agent retains").first.click()
-    assert "/guides/retention.html" in page.url
+    page.locator("ul.search li a", has_text="Streams: tasks that change").first.click()
+    assert "/guides/streams.html" in page.url
 
 
 @needs_chromium
