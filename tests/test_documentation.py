@@ -5,6 +5,7 @@ import re
 import runpy
 import shlex
 import subprocess
+import urllib.request
 from glob import glob
 from pathlib import Path
 
@@ -149,18 +150,45 @@ def test_a_tutorial_works_from_top_to_bottom(name, packages, shorter, tmp_path, 
 
 
 @pytest.mark.usefixtures("in_process")
-def test_the_page_on_the_leaderboard_leads_from_an_own_suite_to_a_rank(tmp_path, monkeypatch):
-    for package in ("torch", "onnx", "onnxruntime"):
+def test_the_pages_on_boards_lead_from_an_own_suite_over_a_served_board_to_a_rank(
+    tmp_path, monkeypatch
+):
+    for package in ("torch", "onnx", "onnxruntime", "fastapi", "httpx"):
         pytest.importorskip(package)
+    from tests.leaderboard.serving import serving
+
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "guides" / "leaderboard.md").read_text()
-    (block,) = re.findall(r"^```sh\n(.*?)^```", page, re.M | re.S)
-    commands = re.findall(r"^(sme|sme-leaderboard) (.*)$", block, re.M)
-    assert len(commands) == 6
-    for program, command in commands:
-        short = "-n 64 --set n_steps=64 --protocol quick-v1"
-        output = run(program, command.replace("-n 20000", short))
-    assert re.search(r"^ *1  PPO", output, re.M)
+    create, score, verify = shell("hosting")
+    submit, read, verify_copy = shell("leaderboard")
+    play(create)
+    with serving("board") as url:
+        play(submit, url)  # a served board scores by itself, and here the page's next command
+        play(score, url)
+        assert re.search(r"^ *1  PPO", play(read, url), re.M)
+        play(verify_copy.replace("--rescore 5", ""), url)
+    play(verify.replace("--rescore 1", ""))
+    assert Path("public/index.html").exists()
+
+
+def shell(page):
+    """The blocks of commands of a guide."""
+    text = (ROOT / "docs" / "guides" / f"{page}.md").read_text()
+    return re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
+
+
+def play(block, url=""):
+    """Run the commands of a block, with little training; the last one's output."""
+    short = {"-n 20000": "-n 64 --seeds 2 --set n_steps=64 --protocol quick-v1"}
+    for full, other in {**short, "https://board.example": url}.items():
+        block = block.replace(full, other)
+    for program, _, command in (line.partition(" ") for line in block.splitlines()):
+        if program == "curl":
+            address = command.removeprefix("-O ")
+            with urllib.request.urlopen(address) as answer:
+                Path(address.rpartition("/")[2]).write_bytes(answer.read())
+        else:
+            output = run(program, command)
+    return output
 
 
 def run(program, command):

@@ -273,8 +273,8 @@ def serve(
 ) -> None:
     """Serve the board: its pages, and an API that accepts submissions, and score them.
 
-    Only this machine can reach it. Put an HTTPS proxy in front of it for others, as in
-    docs/guides/deployment.md. Scoring needs bubblewrap (apt install bubblewrap).
+    Only this machine can reach it. Put an HTTPS proxy in front of it for others: the guide
+    "Hosting a board" has a configuration. Scoring needs bubblewrap (apt install bubblewrap).
 
     Examples:
 

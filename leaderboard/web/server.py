@@ -64,8 +64,7 @@ def serve(
     if not behind_proxy and not _is_loopback(host):
         raise OptionError(
             f"host={host!r:.80}: must be a loopback address, such as 127.0.0.1. Put a reverse "
-            "proxy in front of it, as docs/guides/deployment.md shows; if only the proxy reaches "
-            "this address, add --behind-proxy."
+            "proxy in front of it; if only the proxy reaches this address, add --behind-proxy."
         )
     secrets = list(season_secrets)
     if unsafe_no_sandbox and workers and secrets:

@@ -59,6 +59,7 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
     before = page(board, "seasons/autumn.html")
     assert HOSTILE in before.words
     assert OFFLINE.commitment in before.words
+    assert "an entry of the organiser proves nothing" in before.words
     assert before.words.count("replaced") == 1
     assert before.words.count("waits for the reveal") == 2
     assert MASTER.raw.hex() not in before.words

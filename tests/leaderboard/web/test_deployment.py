@@ -1,4 +1,4 @@
-"""The configuration that docs/guides/deployment.md recommends: a board behind a real nginx."""
+"""The configuration that docs/guides/hosting.md recommends: a board behind a real nginx."""
 
 import contextlib
 import os
