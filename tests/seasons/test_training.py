@@ -85,7 +85,7 @@ def test_the_page_on_seasons_leads_from_a_ticket_to_its_end(server, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     server.ticket.model_copy().write("ticket.json")
     page = (ROOT / "docs" / "guides" / "seasons.md").read_text()
-    page = page.split("## Taking part online")[1]
+    page = page.split("## Take part online")[1]
     [block] = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     assert "n_steps=256" in block
     block = block.replace("n_steps=256", f"n_steps={BUDGET // 8}, n_epochs=1")
