@@ -40,6 +40,7 @@ myst_links_external_new_tab = False
 
 nb_execution_mode = "off"  # tutorials have stored outputs: see docs/notebooks.py
 
+smartquotes = False  # what is quoted may be JSON to type, and two hyphens begin an option
 highlight_language = "text"  # of blocks without a language
 
 html_theme = "furo"

@@ -20,6 +20,7 @@ from sphinx.util.docutils import SphinxDirective
 from typer.main import get_command
 
 _SPECIAL = re.compile(r"([\\*_\[\]<>|#$])")
+_OPTION = re.compile(r"(?<![\w`-])(--[a-z][a-z-]*)")
 
 
 def page(program: str, module: str) -> str:
@@ -63,8 +64,9 @@ def _text(text: str) -> Iterator[str]:
 
 
 def _prose(text: str) -> str:
+    """Markdown in which options are code."""
     parts = text.split("`")
-    parts[::2] = [_SPECIAL.sub(r"\\\1", part).replace("--", r"\-\-") for part in parts[::2]]
+    parts[::2] = [_OPTION.sub(r"`\1`", _SPECIAL.sub(r"\\\1", part)) for part in parts[::2]]
     return "`".join(parts)
 
 

@@ -2,16 +2,20 @@
 
 They are written to be read as text: code is in single backticks, and formulas and examples
 are indented blocks. Doctests stay as they are. Types of NumPy have their own names in signatures,
-not what these stand for.
+not what these stand for; a document's fields have their types and defaults, and nothing of
+Pydantic's; named constants and factories are the values that they give.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import re
-from typing import Any
+import sys
+from typing import Any, get_type_hints
 
 import numpy.typing as npt
+from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util.typing import stringify_annotation
 
@@ -19,6 +23,7 @@ _CODE = re.compile(r"(?<![`\w])`([^`]+)`(?!`)")
 _SPECIAL = re.compile(r"([*|]|(?<=\w)_(?!\w))")
 _SEVERAL = re.compile(r"^(:(?:ivar|param|raises) )([^:]*, [^:]*):")
 _ARRAY = re.compile(r"ndarray\[tuple\[Any, \.\.\.\], dtype\[([\w.]+)\]\]")
+_CONSTANT = re.compile(r"(= ?)([A-Z][A-Z_]+)\b(?!\.)")
 _ARRAY_LIKE = stringify_annotation(npt.ArrayLike, "smart")
 
 
@@ -84,13 +89,49 @@ def _after_napoleon(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]
 ) -> None:
     """`low, high: text` describes two names; to Sphinx it would be one of the type `low,`."""
+    if _is_document(obj):  # its signature has the types, and the page of files what is allowed
+        lines[:] = [line for line in lines if not line.startswith(":vartype ")]
     lines[:] = [_SEVERAL.sub(lambda m: m[1] + m[2].replace(", ", ",") + ":", ln) for ln in lines]
 
 
 def _on_signature(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, arguments: str, returns: str
 ) -> tuple[str | None, str | None]:
+    if arguments and _is_document(obj):
+        arguments = _fields(obj)
+    elif arguments:
+        arguments = _with_values(arguments, obj)
     return arguments and short_types(arguments), returns and short_types(returns)
+
+
+def _is_document(obj: Any) -> bool:
+    return inspect.isclass(obj) and issubclass(obj, BaseModel)
+
+
+def _fields(model: type[BaseModel]) -> str:
+    types, fields = get_type_hints(model), []
+    for name, field in model.model_fields.items():
+        fields.append(f"{name}: {stringify_annotation(types[name], 'smart')}")
+        if not field.is_required():
+            default = field.get_default(call_default_factory=True, validated_data={})
+            plain = f"{type(default).__name__}()" if _is_document(type(default)) else repr(default)
+            fields[-1] += f" = {plain}"
+    return f"(*, {', '.join(fields)})"
+
+
+def _with_values(arguments: str, obj: Any) -> str:
+    if dataclasses.is_dataclass(obj):
+        for field in dataclasses.fields(obj):
+            if field.default_factory is not dataclasses.MISSING:
+                value = repr(field.default_factory())
+                arguments = arguments.replace("<factory>", value, 1)
+    module = sys.modules.get(getattr(obj, "__module__", None) or "")
+
+    def value_of(default: re.Match[str]) -> str:
+        equals, name = default.groups()
+        return f"{equals}{getattr(module, name)!r}" if hasattr(module, name) else default[0]
+
+    return _CONSTANT.sub(value_of, arguments)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

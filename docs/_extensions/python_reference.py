@@ -81,6 +81,7 @@ def _directive(path: str, value: Any) -> list[str]:
         return [f".. autoexception:: {path}", "   :show-inheritance:", ""]
     if inspect.isclass(value):
         options = ["   :members:", "   :member-order: bysource", "   :show-inheritance:"]
+        options += ["   :exclude-members: model_config"]
         return [f".. autoclass:: {path}", *options, ""]
     if typing.get_origin(value) is not None:
         return [f".. py:type:: {path}", "", f"   {_alias(value)}", ""]

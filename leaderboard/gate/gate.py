@@ -235,7 +235,7 @@ def _check_node(node: Any, operators: Collection[str], opset: int) -> None:
         _refuse(
             "onnx_op",
             f"op_type={operator!r}",
-            "must be an operator of a feed-forward network",
+            'must be an operator of a feed-forward network (see the tutorial "Your own agent")',
             "Export the deterministic actor alone with `sme_registry.export_onnx`, which "
             "removes what it can and says how to rewrite the rest",
         )

@@ -106,7 +106,7 @@ def export_onnx(
             f"{written}: has the operators {', '.join(refused)}, which boards do not accept; "
             "evaluations do. To submit it, export the feed-forward actor alone, and write it with "
             "`@`, slices, `split(n, -1)`, `cat` and `view(-1, n)`. "
-            "The tutorial on your own agent lists the operators that pass.",
+            'The tutorial "Your own agent" lists the operators that pass.',
             stacklevel=2,
         )
     return written

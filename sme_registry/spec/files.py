@@ -118,7 +118,7 @@ class Resolved(NamedTuple, Generic[_D]):
 
 
 class EnvFile(Envelope):
-    """A task's file: `specs/envs/*.json`, or what `sme_registry.save` writes.
+    """A task's file: one of the package, or what `sme_registry.save` writes.
 
     Attributes:
       spec: the task.
@@ -139,7 +139,7 @@ class EnvFile(Envelope):
 
 
 class StreamFile(Envelope):
-    """A stream's file: `specs/streams/*.json`, or what `sme_registry.save` writes.
+    """A stream's file: one of the package, or what `sme_registry.save` writes.
 
     Attributes:
       stream: the stream.
@@ -169,7 +169,7 @@ class StreamFile(Envelope):
 
 
 class SuiteFile(Envelope):
-    """A suite's file: `specs/suites/*.json`.
+    """A suite's file, such as `sme new --task` writes.
 
     Attributes:
       suite: the suite.
@@ -182,7 +182,7 @@ class SuiteFile(Envelope):
 
 
 class StudyFile(Envelope):
-    """A study's file: `specs/studies/*.json`.
+    """A study's file, such as `sme study new` writes.
 
     Attributes:
       plan: the study plan.
@@ -204,7 +204,7 @@ class StudyFile(Envelope):
 
 
 class ProtocolFile(Envelope):
-    """A protocol's file: `specs/protocols/*.json`.
+    """A protocol's file.
 
     Attributes:
       protocol: the protocol.

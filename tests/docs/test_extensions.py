@@ -16,8 +16,11 @@ import docstrings
 import links
 import python_reference
 import schema_files
+from sphinx.util.inspect import signature as inspect_signature
+from sphinx.util.inspect import stringify_signature
 
 import sme_registry
+from sme_registry import seasons
 from sme_registry.cli.show import _SCHEMAS
 
 
@@ -71,6 +74,38 @@ def test_every_command_and_option_is_in_the_reference():
     assert "sme study compare runs/smoke PPO TD3" in sme
     board = command_reference.page("sme-leaderboard", "leaderboard.cli")
     assert "(sme-leaderboard-submit)=\n## sme-leaderboard submit" in board
+    assert "Replace the bundle of `--out`." in board
+    assert "docs/" not in sme + board
+    text = re.sub(r"```.*?```|`[^`]*`", "", sme + board, flags=re.S)
+    assert not re.findall(r".*--\w.*", text)  # an option is code wherever it is named
+
+
+def signature(path):
+    module, _, name = path.rpartition(".")
+    value = getattr(importlib.import_module(module), name)
+    kind = "class" if inspect.isclass(value) else "function"
+    text = stringify_signature(inspect_signature(value), unqualified_typehints=True)
+    arguments = text.rpartition(" -> ")[0] or text
+    return docstrings._on_signature(None, kind, path, value, {}, arguments, "")[0]
+
+
+def test_a_signature_has_plain_types_and_defaults_as_values():
+    spec = signature("sme_registry.SMESpec")
+    assert "state_dim: int = 8, action_dim: int = 4" in spec
+    assert "policy_init: Literal['semi_orthogonal', 'unit_variance'] = 'semi_orthogonal'" in spec
+    assert "FieldInfo" not in signature("sme_registry.EvaluationProtocol")
+    assert "hyperparameters: dict[str, ~pydantic.types.JsonValue] = {}" in signature(
+        "sme_registry.spec.StudyAlgorithm"
+    )
+    assert "plan: dict[str, ~pydantic.types.JsonValue] = {}" in signature(
+        "sme_registry.diagnosis.Subject"
+    )
+    assert docstrings._with_values("(patience: float = PATIENCE)", seasons.make) == (
+        "(patience: float = 900.0)"
+    )
+    assert ":exclude-members: model_config" in "\n".join(
+        python_reference._directive("sme_registry.SMESpec", sme_registry.SMESpec)
+    )
 
 
 def test_every_document_with_a_json_schema_has_a_file():
