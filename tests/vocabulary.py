@@ -140,6 +140,7 @@ QUANTITIES = {
     "hidden": "widths of a network's hidden layers",
     "learning_rate": "step size of the optimiser",
     "discount": "γ",
+    "gamma": "γ of the values that a critic is compared with",
     "expectile": "τ of IQL",
     "inverse_temperature": "β of IQL",
     "max_weight": "upper limit of IQL's exp(β advantage)",
