@@ -346,7 +346,7 @@ class TestAWriterThatFails:
         script = (
             "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (60 * 1024, 60 * 1024)); "
             "from sme_registry.cli import main; import sys; "
-            "sys.argv[1:] = ['dataset', 'make', 'Default', '-n', '300', '--out', sys.argv[1]]; "
+            "sys.argv[1:] = ['data', 'make', 'Default', '-n', '300', '--out', sys.argv[1]]; "
             "main()"
         )
         done = run(script, tmp_path)

@@ -81,7 +81,7 @@ def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, monke
     assert "Findings (1 seed, 1 update" in result.stdout
     page = (folder / "diagnosis.md").read_text()
     names = sorted(path.name for path in folder.glob("*.png"))
-    assert len(names) == 4
+    assert len(names) == 5
     assert all(f"]({name})" in page for name in names)
     assert all((folder / name).with_suffix(".pdf").exists() for name in names)
     for figure in set(figures):
