@@ -62,7 +62,8 @@ def test_a_picture_drawn_again_is_the_same(name):
     content = pictures.picture(name)
     assert content == pictures.picture(name)
     new, kept = (
-        np.asarray(Image.open(source)) for source in (io.BytesIO(content), FOLDER / pictures.names()[name])
+        np.asarray(Image.open(source))
+        for source in (io.BytesIO(content), FOLDER / pictures.names()[name])
     )
     assert new.shape == kept.shape
     assert np.mean(new != kept) < 0.01  # another machine may round an edge differently
