@@ -1,7 +1,5 @@
 """Critics against exact values: whose value, which order of actions, and models without one."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -173,13 +171,13 @@ def test_what_is_found_of_a_critic_has_its_verdict_and_a_sentence_with_numbers(
     assert len(verdict.sentence()) > 20
 
 
-def test_a_diagnosis_of_a_model_has_its_critic_and_draws_it(laid_out):
+def test_a_diagnosis_of_a_model_has_its_critic_and_draws_it(laid_out, tmp_path):
     pytest.importorskip("matplotlib")
     spec = SMESpec(**SMALL, shaping={"scale": 3})
     diagnosis = diagnose(load_policy(model(TD3, spec=spec), spec), states=64, episodes=8)
     assert diagnosis.measurements.critic.region("OOD 5").misled_ranking is not None
     assert diagnosis.verdict("critic_level").evidence["gamma"] == 0.9
-    draw(diagnosis, Path("unused"))
+    draw(diagnosis, tmp_path)
     labels = [axes.get_ylabel() for figure in laid_out for axes in figure.axes]
     assert "discounted value" in labels
     assert "critic" not in diagnosis_of("linear", DEEP).model_dump()["measurements"]
