@@ -16,6 +16,7 @@ import numpy.typing as npt
 from matplotlib import colormaps
 from PIL import Image
 
+from sme_registry.explorer.page import resting
 from sme_registry.io import write_atomically
 from sme_registry.spec import EnvFile, SMESpec, StreamFile, catalogue
 from sme_registry.task import Task, materialize
@@ -90,7 +91,7 @@ def draw(folder: Path) -> None:
 def _optimum(task: Task, over: tuple[int, int]) -> tuple[Array, Array | None]:
     """π* and the limits (None without safety), `[n, n, A]`, over two channels, others at ½."""
     side = -EPSILON / 2 + (np.arange(_POINTS) + 0.5) * (1 + EPSILON) / _POINTS
-    s = np.full((_POINTS**2, task.spec.state_dim), 0.5)
+    s = np.tile(resting(task.spec)[: task.spec.state_dim], (_POINTS**2, 1))
     s[:, over[0]], s[:, over[1]] = np.tile(side, _POINTS), np.repeat(side, _POINTS)
 
     def on_grid(function: Callable[[Array], Array]) -> Array:

@@ -181,6 +181,7 @@ def facts(
         "observe": programs.observe(task).to_dict(),
         "policies": policies,
         "rest": _rounded(resting(spec)),
+        "start": _rounded(_start(spec)),
         "episode": _episode(task, run, fitted, episodes, seed),
         "training": _training(None if run is None else run.log),
         "regions": None if report is None else _regions(report),
@@ -214,7 +215,12 @@ def _name(subject: Subject) -> str:
 
 
 def resting(spec: SMESpec) -> Array:
-    """Where a page opens: a random point (at the centre each optimum is ½), t = T/2, r_cum = 0."""
+    """The cube's centre, halfway through an episode, r_cum = 0: where inputs that are not shown are."""
+    return np.array([*[0.5] * (spec.state_dim + spec.distractors), 0.5, 0.0])
+
+
+def _start(spec: SMESpec) -> Array:
+    """Where a page opens: a random point, since at the centre each optimum is ½."""
     point = draw.uniform(0, "explorer/point", spec.state_dim + spec.distractors)
     return np.array([*point.round(2), 0.5, 0.0])
 

@@ -40,7 +40,7 @@ const QUANTITIES = [
 ];
 
 const view = {
-  point: Float64Array.from(data.rest),
+  point: Float64Array.from(data.start),
   axes: [0, 1],
   epsilon: 1,
   channel: 0,
