@@ -18,38 +18,43 @@ def _critic_of(run: TaskDiagnosis) -> CriticReport:
     return run.measurements.critic
 
 
+def _without_ranking(report: CriticReport) -> Decision:
+    return Decision("critic_of_states" if report.kind == "V" else "rewards_alike", {})
+
+
 @_about(
     yes="critic_ahead_of_actor",
     no="actor_follows critic_ranks_badly critic_between critic_of_states",
+    unclear="rewards_alike",
     thresholds="ranks_well ranks_badly actor_lags",
 )
 def _critic_ranking(run: TaskDiagnosis) -> Decision:
-    ranking = _critic_of(run).region(VISITED).ranking
+    report = _critic_of(run)
+    ranking = report.region(VISITED).ranking
     if ranking is None:
-        return Decision("critic_of_states", {})
+        return _without_ranking(report)
     evidence = {"ranking": ranking, "normalised_regret": run.learnt}
-    if ranking < THRESHOLDS["ranks_badly"]:
+    if _badly(ranking):
         return Decision("critic_ranks_badly", evidence)
     if run.learnt < THRESHOLDS["actor_lags"]:
         return Decision("actor_follows", evidence)
-    ahead = ranking >= THRESHOLDS["ranks_well"]
-    return Decision("critic_ahead_of_actor" if ahead else "critic_between", evidence)
+    ahead = "critic_ahead_of_actor" if _well(ranking) else "critic_between"
+    return Decision(ahead, evidence)
 
 
 @_about(
     yes="ranks_inside_only",
     no="ranks_alike critic_of_states",
+    unclear="rewards_alike",
     thresholds="ranks_well ranks_badly",
 )
 def _critic_outside(run: TaskDiagnosis) -> Decision:
     report = _critic_of(run)
     inside, outside = report.region("WD"), report.regions[-1]
     if inside.ranking is None or outside.ranking is None:
-        return Decision("critic_of_states", {})
-    only = inside.ranking >= THRESHOLDS["ranks_well"]
-    only = only and outside.ranking < THRESHOLDS["ranks_badly"]
+        return _without_ranking(report)
     evidence = {"wd": inside.ranking, "outside": outside.ranking, "region": outside.region}
-    return Decision(only, evidence)
+    return Decision(_well(inside.ranking) and _badly(outside.ranking), evidence)
 
 
 @_about(
@@ -62,10 +67,20 @@ def _discount(run: TaskDiagnosis) -> Decision:
     cube = report.region("WD")
     if cube.misled_ranking is None or cube.ranking is None:
         return Decision("nothing_misleads", {})
-    misled = cube.misled_ranking >= THRESHOLDS["ranks_well"]
-    misled = misled and cube.ranking < THRESHOLDS["ranks_badly"]
-    evidence = {"ranking": cube.ranking, "misled_ranking": cube.misled_ranking}
-    return Decision(misled, evidence | {"gamma": report.gamma})
+    evidence = {
+        "ranking": cube.ranking,
+        "misled_ranking": cube.misled_ranking,
+        "gamma": report.gamma,
+    }
+    return Decision(_well(cube.misled_ranking) and _badly(cube.ranking), evidence)
+
+
+def _well(ranking: float) -> bool:
+    return ranking >= THRESHOLDS["ranks_well"]
+
+
+def _badly(ranking: float) -> bool:
+    return ranking < THRESHOLDS["ranks_badly"]
 
 
 @_about(

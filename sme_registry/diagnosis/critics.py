@@ -42,9 +42,9 @@ class CriticRegion(StrictModel):
       region: "visited", "WD" or "OOD m".
       states: how many.
       ranking: share of pairs of actions, around the policy's in one state, that the critic orders
-        as the step reward does: ½ is chance, 1 perfect. Null for V.
+        as the step reward does: ½ is chance, 1 perfect. Null for V, and where no two differ.
       misled_ranking: the same against the reward that shaping leaves to a learner of this γ; null
-        without shaping.
+        without shaping, too.
       claim: mean of what the critic says.
       finite: mean exact value to the end of the episode.
       continuing: mean exact value of going on after it, which an agent that bootstraps at a
@@ -318,7 +318,6 @@ class _Levels(NamedTuple):
     @classmethod
     def of(cls, task: Task, learnt: _Critic, at: _Points, tail: float | None, seed: int) -> _Levels:
         mode = learnt.mode(at.observation)
-        learnt.bonus = 0.0
         returns = expected_returns(
             task, learnt, at.s, t=at.t, gamma=learnt.gamma, seed=seed,
             r_cum=at.r_cum, distractors=at.d, actions=mode,
@@ -360,7 +359,9 @@ def _times(task: Task, at: _Points, levels: _Levels) -> list[CriticTime]:
     return rows
 
 
-def _rankings(task: Task, learnt: _Critic, at: _Points, seed: int) -> tuple[float, float | None]:
+def _rankings(
+    task: Task, learnt: _Critic, at: _Points, seed: int
+) -> tuple[float | None, float | None]:
     """Shares of pairs that the critic orders as the step reward, and as what misleads it."""
     spec, gamma = task.spec, learnt.gamma
     mode = learnt.mode(at.observation)
@@ -379,10 +380,10 @@ def _rankings(task: Task, learnt: _Critic, at: _Points, seed: int) -> tuple[floa
     return ranking, _share_in_order(claims, gamma**payout * rewards + misleading, dead)
 
 
-def _share_in_order(claims: Array, truth: Array, dead: Mask) -> float:
-    """Of pairs of actions that differ, and of which one lives on, the share ordered alike."""
+def _share_in_order(claims: Array, truth: Array, dead: Mask) -> float | None:
+    """Of pairs that differ, and of which one lives on, the share ordered alike; None of none."""
     first, second = np.triu_indices(len(claims), 1)
     difference = truth[first] - truth[second]
     counted = (difference != 0) & ~(dead[first] & dead[second])
     alike = np.sign(claims[first] - claims[second]) == np.sign(difference)
-    return float(alike[counted].mean()) if counted.any() else float("nan")
+    return float(alike[counted].mean()) if counted.any() else None

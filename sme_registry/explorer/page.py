@@ -215,7 +215,7 @@ def _name(subject: Subject) -> str:
 
 
 def resting(spec: SMESpec) -> Array:
-    """The cube's centre, halfway through an episode, r_cum = 0: where inputs that are not shown are."""
+    """Where inputs that are not shown are: the cube's centre, t = T/2, r_cum = 0."""
     return np.array([*[0.5] * (spec.state_dim + spec.distractors), 0.5, 0.0])
 
 

@@ -88,6 +88,15 @@ def test_a_critic_that_knows_the_reward_ranks_perfectly_and_its_opposite_never()
         assert ranking == pytest.approx(share, abs=0.01)
 
 
+def test_where_no_two_actions_differ_in_reward_there_is_no_ranking():
+    never_paid = SMESpec(**SMALL, r_min=0.999)
+    subject = load_policy(model(TD3, spec=never_paid), never_paid)
+    diagnosis = diagnose(subject, states=64, episodes=8)
+    assert diagnosis.measurements.critic.region("WD").ranking is None
+    verdict = diagnosis.verdict("critic_ranking")
+    assert (verdict.answer, verdict.reason) == ("cannot tell", "rewards_alike")
+
+
 def test_a_critic_that_shaping_misleads_is_told_from_one_that_has_not_learnt():
     spec = SMESpec(**SMALL, shaping={"scale": 30})
     task, judged = sme_registry.materialize(spec), model(TD3, gamma=0.5, spec=spec)
@@ -136,8 +145,9 @@ def report_of(ranking=0.9, outside=0.9, misled=None, bias=0.0, gamma=0.9, sweeps
         )  # fmt: skip
 
     shares = {"visited": ranking, "WD": ranking, "OOD 5": outside}
+    kind = "V" if ranking is None else "Q"
     return CriticReport(
-        algorithm="TD3", kind="Q", spec_digest=SPEC.digest, gamma=gamma, sweeps=sweeps, seed=0,
+        algorithm="TD3", kind=kind, spec_digest=SPEC.digest, gamma=gamma, sweeps=sweeps, seed=0,
         regions=[region(name, share) for name, share in shares.items()],
         times=[CriticTime(time=0.5, claim=1.0 + bias, finite=0.5, continuing=1.0)],
     )  # fmt: skip
