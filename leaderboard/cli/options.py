@@ -98,6 +98,13 @@ BoardOrUrl = Annotated[
         parser=board_or_url,
     ),
 ]
+SubmissionId = Annotated[
+    str,
+    typer.Argument(
+        metavar="ID",
+        help="The submission's id: in full for a URL; its first digits suffice for a folder.",
+    ),
+]
 SuiteName = Annotated[
     str,
     typer.Option(

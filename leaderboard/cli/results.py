@@ -19,6 +19,7 @@ from leaderboard.cli.options import (
     BoardFolder,
     BoardOrUrl,
     Json,
+    SubmissionId,
     is_url,
     open_board,
 )
@@ -164,13 +165,7 @@ def _interval(value: Estimate) -> str:
 @app.command()
 def show(
     board: BoardOrUrl,
-    id: Annotated[
-        str,
-        typer.Argument(
-            metavar="ID",
-            help="The submission's id: in full for a URL; its first digits suffice for a folder.",
-        ),
-    ],
+    id: SubmissionId,
     json: Json = False,
 ) -> None:
     """Show one submission: its method, submitter, runs and scores.

@@ -25,6 +25,7 @@ from leaderboard.cli.options import (
     KeyFile,
     MethodVersion,
     Statement,
+    SubmissionId,
     board_document,
     is_url,
     method_name,
@@ -276,13 +277,7 @@ def _print_scores(result: Result) -> None:
 @app.command()
 def withdraw(
     board: BoardOrUrl,
-    id: Annotated[
-        str,
-        typer.Argument(
-            metavar="ID",
-            help="The submission's id: in full for a URL; its first digits suffice for a folder.",
-        ),
-    ],
+    id: SubmissionId,
     reason: Annotated[str, typer.Option(help="Reason, shown on its page.")] = "",
     key: KeyFile = DEFAULT_KEY,
 ) -> None:
