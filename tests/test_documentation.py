@@ -31,6 +31,13 @@ def cells(tutorial, kind):
 @pytest.mark.parametrize(
     ("name", "shorter"),
     [
+        (
+            "README",
+            {
+                "--steps 20000": "--steps 64 --set n_steps=64",
+                "-n 20000 --seeds 3": "-n 64 --set PPO.n_steps=64 --protocol quick-v1 --seeds 1",
+            },
+        ),
         ("tasks", {}),
         (
             "streams",
@@ -46,11 +53,12 @@ def cells(tutorial, kind):
         ("offline", {"--transitions 50000": "-n 1000 --protocol quick-v1", "-n 20000": "-n 20"}),
     ],
 )
+@pytest.mark.usefixtures("in_process")
 def test_a_guide_works_from_top_to_bottom(name, shorter, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    page = (ROOT / "docs" / "guides" / f"{name}.md").read_text()
-    work_through(page, shorter)
+    folder = ROOT if name == "README" else ROOT / "docs" / "guides"
+    work_through((folder / f"{name}.md").read_text(), shorter)
 
 
 def work_through(page, shorter):

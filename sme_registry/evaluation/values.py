@@ -48,7 +48,7 @@ def values(
       states: `[B, S]`, also outside the cube.
       gamma: discount in [0, 1].
       t: steps before each state, `[B]` or one number, in [0, T).
-      accumulated: r_cum before each state, `[B]` or one number, in [0, k).
+      accumulated: r_cum before each state, `[B]` or one number, in [0, k].
       distractors: `[B, m]`, by default drawn from `seed`.
       actions: first actions `[B, A]` of the unit range, for a value of actions (Q); by default
         the policy's.

@@ -19,12 +19,12 @@ from jax.custom_batching import custom_vmap
 
 from sme_registry.errors import ActionError, OptionError, StateError
 from sme_registry.jax import task
-from sme_registry.jax.task import StepNumbers, TaskParams
+from sme_registry.jax.task import StepDraws, TaskParams
 from sme_registry.task.task import ON_TOP
 
 Info = dict[str, jax.Array]
 
-_NO_NUMBERS = StepNumbers(None, None)
+_NO_NUMBERS = StepDraws(None, None)
 _ONE = "Use jax.vmap for several environments."
 
 
@@ -86,7 +86,7 @@ reset_env = reset
 
 
 def advance(
-    state: EnvState, action: jax.Array, numbers: StepNumbers | None, params: TaskParams
+    state: EnvState, action: jax.Array, numbers: StepDraws | None, params: TaskParams
 ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
     """`step_env` with the numbers of `task.random_numbers`: nothing in it is random."""
     action = jnp.asarray(action)
@@ -122,7 +122,7 @@ def advance(
 
 
 def moved(
-    state: EnvState, action: jax.Array, numbers: StepNumbers | None, params: TaskParams
+    state: EnvState, action: jax.Array, numbers: StepDraws | None, params: TaskParams
 ) -> EnvState:
     numbers = numbers or _NO_NUMBERS
     return state._replace(

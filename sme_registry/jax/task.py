@@ -125,7 +125,7 @@ class Shaping(NamedTuple):
     layer: UniformLayer
 
 
-class StepNumbers(NamedTuple):
+class StepDraws(NamedTuple):
     """The random numbers of a step: those of its distractors, and its noise ξ and ζ `[1 + S]`."""
 
     distractors: jax.Array | None
@@ -313,14 +313,14 @@ def first_distractors(key: jax.Array, params: TaskParams) -> jax.Array | None:
     return uniform_states(jax.random.fold_in(key, _OF_START), params.form.distractors)
 
 
-def random_numbers(key: jax.Array, params: TaskParams) -> StepNumbers:
+def random_numbers(key: jax.Array, params: TaskParams) -> StepDraws:
     """Those of a step; None where it needs none."""
     noise = None
     if params.form.noise:
         of_noise = jax.random.fold_in(key, _OF_NOISE)
         width = (1 + params.form.state_dim,)
         noise = jax.random.normal(of_noise, width, jnp.float32).astype(jnp.float64)
-    return StepNumbers(_of_distractors(key, params), noise)
+    return StepDraws(_of_distractors(key, params), noise)
 
 
 def _of_distractors(key: jax.Array, params: TaskParams) -> jax.Array | None:
