@@ -197,4 +197,4 @@ def test_the_table_has_the_behaviour_policy_next_to_the_learners(analysis):
         "IQL": "1.052 ± 0.030 (5)",
     }
     assert improvements.BC[0].startswith("+0.004 [")
-    assert improvements.IQL.iloc[-1].endswith(" *")
+    assert improvements.IQL.iloc[-1].endswith(" †")
