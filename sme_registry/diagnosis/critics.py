@@ -210,6 +210,7 @@ def critic(
       seed: of states, of noise and of sampled actions.
 
     Example:
+      >>> from sme_registry.diagnosis import critic
       >>> report = critic("runs/ppo/model.zip", "Default", states=100)
       >>> report.kind
       'V'

@@ -129,6 +129,8 @@ FIELDS = [
     ("policy_init", "unit_variance", {"inner/0"}),  # where it widens: from 6 to 9
     ("team", {"agents": [{"action_dim": 3}], "reward": "team"}, set()),
     ("safety", {"tightness": 0.2}, {"safety"}),
+    ("shaping", {"scale": 3.0}, {"shaping"}),
+    ("noise", {"reward": 0.1, "transition": 0.1}, set()),
     ("observation", {"distractors": 2}, set()),
     ("observation", {"distractors": 2, "dynamics": "driven"}, {"distractors"}),
     ("observation", {"mixing": "nonlinear", "mixing_depth": 2}, {"mixing/0", "mixing/1"}),
@@ -142,6 +144,8 @@ def parts(task):
     if task.distractor_transition:
         named["distractors"] = task.distractor_transition[0]
     named |= {f"mixing/{i}": layer.W for i, layer in enumerate(task.mixing)}
+    if task.shaping:
+        named["shaping"] = task.shaping[0].W
     return {"W": task.W, "b": task.b, **named, "output": task.policies[0][-1].W}
 
 
