@@ -217,6 +217,21 @@ class TestShow:
         assert facts["parameter_memory_bytes"] == 8 * numbers
         assert (facts["largest_return"], facts["payouts_in_a_full_episode"]) == (100, 4)
 
+    @pytest.mark.parametrize(
+        ("name", "fact", "value"),
+        [
+            ("CompensatedSafety20", "largest_return_without_cost", 100),
+            ("Foresight30", "largest_return", "100 − P₀(s₀), with the potential P₀ in [0, 30]"),
+            ("NoisyReward30", "largest_return", "100 on average"),
+            ("NoisyState30", "largest_return", 100),
+        ],
+    )
+    def test_the_largest_return_is_that_of_the_optimum(self, name, fact, value):
+        facts = json.loads(good("show", name, "--json").stdout)["derived"]
+        returns = {key: facts[key] for key in facts if key.startswith("largest_return")}
+        assert returns == {fact: value}
+        assert re.search(rf"^{fact} +{re.escape(str(value))}$", good("show", name).stdout, re.M)
+
     def test_limits_and_what_the_agent_sees_are_fields_and_facts(self):
         observation = {"distractors": 32, "dynamics": "driven", "mixing": "nonlinear"}
         options = ("--safety", '{"tightness": 0.2}', "--observation", json.dumps(observation))

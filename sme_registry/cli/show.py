@@ -266,7 +266,7 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
         **_spaces(spec),
         "parameters": size // 8,
         "parameter_memory_bytes": size,
-        "largest_return": spec.horizon,  # of each agent in a team
+        **_largest_return(spec),
         "payouts_in_a_full_episode": math.ceil(spec.horizon / spec.k),
         "largest_payout": min(spec.k, spec.horizon),
     }
@@ -275,6 +275,22 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
     if spec.safety is not None:
         facts["limits"] = f"in [{1 - 2 * spec.safety.tightness:g}, 1], one for each action channel"
     return facts
+
+
+def _largest_return(spec: SMESpec) -> dict[str, Any]:
+    """What the optimal policy is paid in an episode, without a discount; of each agent in a team.
+
+    What is paid on top for safety makes other policies earn more than it, but for a cost.
+    """
+    name = "largest_return_without_cost" if spec.compensated else "largest_return"
+    noisy = " on average" if spec.reward_noise else ""
+    if spec.shaping is None:
+        return {name: f"{spec.horizon}{noisy}" if noisy else spec.horizon}
+    if spec.shaping.discount == 1:
+        c = f"{spec.shaping.scale:g}"
+        return {name: f"{spec.horizon} − P₀(s₀){noisy}, with the potential P₀ in [0, {c}]"}
+    # Σ F then depends on the states between: π* is optimal only for a learner of this discount.
+    return {name: f"not that of π*, which is optimal at γ = {spec.shaping.discount:g}"}
 
 
 def _env_id(spec: SMESpec) -> str:

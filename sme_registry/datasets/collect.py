@@ -360,7 +360,8 @@ def reference_scores(
     """The scores of a data set's behaviour, of the constant ½ and of the optimum.
 
     In the data set's own states they are exact. By rollouts they are means over whole episodes with
-    their own starts, with standard errors; the optimum's return is T.
+    their own starts, with standard errors. The optimum's return is T, unless shaping or a price is
+    paid on top: then its episodes are played, too.
     """
     stream, T = "dataset/reference", recipe.spec.horizon
     count = min(_SCORED_EPISODES, _MAX_SCORED_STEPS // T)
@@ -377,7 +378,11 @@ def reference_scores(
         policy = behaviour_policy(recipe, index, task, user, stream)
         similarity, step_reward = transitions.similarities[rows], transitions.step_rewards[rows]
         behaviours.append(_score(similarity, step_reward, rollouts(policy, index)))
-    optimum = EpisodeScores(episodes=0, mean_return=float(T), standard_error=0.0, similarity=1.0)
+    optimum: EpisodeScores | None = EpisodeScores(
+        episodes=0, mean_return=float(T), standard_error=0.0, similarity=1.0
+    )
+    if recipe.spec.shaping is not None or recipe.spec.compensated:
+        optimum = rollouts(_mixture(task, recipe.seed, 0.0, f"{stream}/alpha"), len(behaviours))
     return ReferenceScores(
         constant=_score(*_constant_values(task, transitions), rollouts(constant_policy(task), 0)),
         behaviour=_score(

@@ -180,7 +180,7 @@ class EpisodeScores(StrictModel):
     """Whole episodes of a policy; 0 of them if the values are exact without rollouts."""
 
     episodes: Integer
-    mean_return: Real  # in [0, T], and its standard error over episodes
+    mean_return: Real  # as the agent is paid, and its standard error over episodes
     standard_error: Real
     similarity: _Share  # mean r̃ over all steps
 

@@ -42,7 +42,7 @@ from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.statistics import smoothed
 from sme_registry.task import Task, draw
 from sme_registry.task.draw import Array
-from sme_registry.task.task import REWARD, STEP_REWARD, Mask, Observation
+from sme_registry.task.task import ON_TOP, REWARD, STEP_REWARD, Mask, Observation
 from sme_registry.training.algorithms import one_thread, quiet
 
 CONSTANTS = ("best_constant", "constant")
@@ -155,7 +155,7 @@ class Trajectories(NamedTuple):
     mae: Array  # `[T, n]` mean |a − a*| over channels
     constant_mae: Array  # `[T, n]` the same of the constant ½
     reward: Array  # `[T, n]` step reward r
-    payout: Array  # `[T, n]` payout R
+    payout: Array  # `[T, n]` payout R, without what is paid on top
     alive: Mask  # `[T, n]` whether the episode was still running
     payout_due: Mask  # `[T, n]` whether a payout was due after the step
     terminated: Mask  # `[n]` whether D terminated the episode because of this agent
@@ -194,13 +194,16 @@ def rollout(
     def actions(s: Array, observation: Observation) -> Array:
         return np.clip(act(s.astype(np.float32) if sees_state else observation.copy()), 0.0, 1.0)
 
+    columns = batch.schedule.columns.numbers
+    on_top = [columns[name] for name in ON_TOP if name in columns]
     terminated = np.zeros((agents, n), bool)
     rows: list[tuple[npt.NDArray[Any], ...]] = []
     for step in play(batch, actions):
         a, result = step.action, step.result
         due = ((len(rows) + 1) % task.spec.k == 0) | result.truncated
         mae, constant_mae = (_mae(task, x - result.optimal) for x in (a, 0.5))
-        received, payout = result.values[STEP_REWARD].copy(), result.values[REWARD].copy()
+        received = result.values[STEP_REWARD].copy()
+        payout = result.values[REWARD] - result.values[on_top].sum(axis=0)
         reward = task.reward_of(1.0 - mae) if task.pays_the_team else received
         rows.append((step.state, a, mae, constant_mae, reward, payout, step.running, due))
         terminated |= step.running & result.terminated & (received < task.spec.D)

@@ -110,6 +110,16 @@ def test_scores_on_the_data_sets_states_are_exact():
     assert scores.optimum.step_reward == task.step_reward(found.states, best).mean() == 1.0
 
 
+def test_the_optimums_return_has_what_is_paid_on_top():
+    scores, _, _ = scored(transitions=100, shaping={"scale": 30})
+    optimum = scores.optimum.rollouts
+    # T − P₀(s₀), and P₀ is 30 times a number that is ½ on average.
+    assert optimum.mean_return == pytest.approx(100 - 15, abs=4 * optimum.standard_error)
+    assert optimum.similarity == pytest.approx(1.0, abs=1e-6)
+    scores, _, _ = scored(transitions=100, safety={"tightness": 0.4, "compensated": True})
+    assert scores.optimum.rollouts.mean_return > 110
+
+
 @pytest.mark.parametrize("fields", [{}, {"k": 7, "r_min": 0.3, "D": 0.2}, {"complexity": 10}])
 def test_the_optimums_return_is_the_horizon(fields):
     scores, _, task = scored(transitions=100, **fields)

@@ -69,6 +69,22 @@ def test_a_payout_over_k_independent_rewards_is_explained_by_one_kth():
         assert measured.on_policy.random_credit == pytest.approx(credit, abs=tolerance)
 
 
+@pytest.mark.parametrize(
+    "on_top",
+    [
+        {"shaping": {"scale": 30}},
+        {"noise": {"reward": 3.0}},
+        {"safety": {"tightness": 0.4, "compensated": True}},
+    ],
+    ids=lambda fields: next(iter(fields)),
+)
+def test_credit_is_of_the_payout_and_not_of_what_is_paid_on_top(on_top):
+    for k, credit, tolerance in ((5, 1 / 5, 0.05), (1, 1.0, 1e-6)):
+        task = SPEC.derive(k=k, horizon=50, **on_top)
+        on_policy = diagnosis_of(Noisy(task), task, episodes=64).measurements.on_policy
+        assert on_policy.random_credit == pytest.approx(credit, abs=tolerance)
+
+
 def test_rewards_of_an_episode_that_D_terminated_before_a_payout_have_no_credit():
     reward = np.array([[1.0, 0.2], [0.5, 0.9], [0.0, 0.4], [0.0, 0.6]])
     payout = np.array([[0.0, 0.0], [0.0, 1.1], [0.0, 0.0], [0.0, 1.0]])
