@@ -49,7 +49,7 @@ def table() -> pd.DataFrame:
         (statistic.__name__, kind): {
             (classes, n): round(100 * coverage(sample, n, classes, statistic))
             for classes in (1, 10)
-            for n in (3, 5, 10)
+            for n in (2, 3, 5, 10)
         }
         for statistic in (iqm, mean)
         for kind, sample in KINDS.items()

@@ -47,7 +47,7 @@ TITLES = "misleading", "control", "difference"
 
 
 def plan(algorithm: str, gamma: float) -> StudyFile:
-    """An agent of one discount on the plain task, the misleading ones, their controls, and noise."""
+    """An agent of one discount on the plain task, misleading ones, their controls, and noise."""
     steps, _, scales = BUDGETS[algorithm]
     settings: dict[str, dict[str, Any]] = {"plain": {}}
     for c in scales:

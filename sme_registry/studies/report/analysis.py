@@ -49,9 +49,8 @@ from sme_registry.studies.report.design import (
 from sme_registry.studies.report.frames import FinishedLife, frame, ordered
 from sme_registry.studies.result import CellResult
 
-# With fewer runs an interval is an indication only. Of normal, exponential and two-humped runs, a
-# 95 % interval of one class covers the truth in 32–62 % of cases with 2 runs, in 48–86 % with 3, in
-# 94–98 % with 4 to 10.
+# With fewer runs an interval is an indication only: docs/results/coverage.py measures how often it
+# covers the truth.
 ENOUGH_RUNS = 5
 OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at all
 PLACE = ["class_name", "algorithm"]

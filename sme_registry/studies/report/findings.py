@@ -48,6 +48,7 @@ COLUMNS = (
 )
 THRESHOLDS = {
     "unlearnt": DIAGNOSIS["unlearnt"],  # normalised regret, at least: almost nothing was learnt
+    "stuck": 0.8,  # normalised regret of a run, at least, where another has at most half of it
     "broken": 0.2,  # change of normalised regret, at least
     "hurt": 0.05,  # at least; a smaller one hurts slightly
     "enough_runs": float(ENOUGH_RUNS),  # with fewer runs or pairs a verdict is an indication
@@ -322,12 +323,14 @@ def _caveats(analysis: Analysis, part: RunKind) -> Found:
     if few < ENOUGH_RUNS:
         yield finding(
             section, "few runs", "few",
-            f"Some numbers rest on {plural(few, 'run')}. The 95 % bootstrap interval of 2 runs "
-            "covers the truth in only 32–62 % of cases, of 3 runs in 48–86 %, depending on their "
-            f"distribution, and of 4 or more in 94–98 %. With fewer than {ENOUGH_RUNS}, this "
-            "report calls a result an indication at most.",
+            f"Some numbers rest on {plural(few, 'run')}. The 95 % bootstrap interval of three runs "
+            "covers the truth in only 64–85 % of cases, depending on their distribution, of five "
+            f"in 80–95 %, of ten in 93–97 %. With fewer than {ENOUGH_RUNS}, this report calls a "
+            "result an indication at most.",
             runs=few,
         )  # fmt: skip
+    if not part.streams:
+        yield from _stuck(part.runs)
     if (of_place[part.instance].nunique() < of_place.size()).any():
         yield finding(
             section, "instances", "repeat",
@@ -347,6 +350,23 @@ def _caveats(analysis: Analysis, part: RunKind) -> Found:
     for text in implementation_caveats(analysis.plan, learners):
         yield finding(section, "implementations", "differ", text)
     yield from _without_fresh(analysis, section) if part.streams else _unlike(analysis, section)
+
+
+def _stuck(runs: pd.DataFrame) -> Found:
+    """Runs that learnt nothing where others of the same class and algorithm did."""
+    for (class_name, name), group in runs.groupby(PLACE, sort=False):
+        stuck = group[group.wd_regret >= max(THRESHOLDS["stuck"], 2.0 * group.wd_regret.min())]
+        if not stuck.empty:
+            numbers = conjunction([f"run {run}" for run in stuck.run])
+            yield finding(
+                "caveats", "stuck runs", "stuck",
+                f"{name} on {class_name}: {plural(len(stuck), 'run')} of {len(group)} learnt "
+                f"nothing ({numbers}: WD regret {fixed(stuck.wd_regret.min())} or more) where "
+                f"another ended at {fixed(group.wd_regret.min())}. Runs of two kinds make "
+                "intervals less certain than 95 %.",
+                algorithm=name, class_name=class_name, value=stuck.wd_regret.min(),
+                runs=len(group),
+            )  # fmt: skip
 
 
 def _unlike(analysis: Analysis, section: str) -> Found:

@@ -102,6 +102,17 @@ def test_a_first_class_that_was_not_learnt_is_marked(analysis):
     assert (unlearnt.verdict, unlearnt.value) == ("unlearnt", 0.97)
 
 
+def test_a_run_that_learnt_nothing_where_another_did_is_named(analysis):
+    runs = analysis.runs.copy()
+    of_cell = (runs.class_name == "default") & (runs.algorithm == "Alpha")
+    runs.loc[of_cell, "wd_regret"] = [0.9, 0.4, 0.79, 0.85, 0.4]
+    row = found(dataclasses.replace(analysis, runs=runs), class_name="default")["stuck runs"]
+    assert (row.algorithm, row.value, row.runs) == ("Alpha", 0.85, 5)
+    assert "2 runs of 5 learnt nothing (run 0 and run 3:" in row.sentence
+    runs.loc[of_cell, "wd_regret"] = [0.9, 0.46, 0.79, 0.85, 0.46]  # none has half of it
+    assert "stuck runs" not in found(dataclasses.replace(analysis, runs=runs), class_name="default")
+
+
 @pytest.mark.parametrize(
     ("change", "verdict"), [(0.3, "broken"), (0.1, "hurt"), (0.01, "slightly_hurt")]
 )
