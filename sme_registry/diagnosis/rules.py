@@ -202,7 +202,7 @@ def _limits_of(run: TaskDiagnosis) -> Violations:
 @add_to(
     WHERE,
     "limits",
-    yes="beats_safe_optimum earns_by_violating violates_without_gain",
+    yes="beats_safe_projection earns_by_violating violates_without_gain",
     no="within_limits rarely_violates",
     thresholds="rarely_violating gain",
     needs="limits",
@@ -220,7 +220,7 @@ def _constraint_violation(run: TaskDiagnosis) -> Decision:
     elif share < THRESHOLDS["rarely_violating"]:
         reason = "rarely_violates"
     elif inside.safe_regret < -THRESHOLDS["gain"]:
-        reason = "beats_safe_optimum"
+        reason = "beats_safe_projection"
     else:
         reason = "earns_by_violating" if gain >= THRESHOLDS["gain"] else "violates_without_gain"
     evidence = {

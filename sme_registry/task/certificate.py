@@ -90,8 +90,8 @@ MEANINGS = {
     "over uniform states; 0.5 where the limit has collapsed to a constant.",
     "states_with_a_broken_limit": "Share of uniform states in which π* is above the limit of at "
     "least one channel.",
-    "price_of_safety": "What the best safe policy forgoes of the largest step reward, on average "
-    "over uniform states.",
+    "price_of_safety": "What the safe projection forgoes of the largest step reward, on average "
+    "over uniform states; a planner may forgo less.",
     "distractor_row_sums": "How far a row of the distractors' W is from the sum 1, as for the "
     "state.",
     "uniform_distractors": "Largest √N·KS distance of a distractor from uniform, "

@@ -56,7 +56,7 @@ def third_channel(observation):
 @pytest.mark.parametrize(
     ("policy", "answer", "reason"),
     [
-        ("optimal", "yes", "beats_safe_optimum"),
+        ("optimal", "yes", "beats_safe_projection"),
         ("safe_projection", "no", "within_limits"),
         ("constant", "no", "within_limits"),
         (distracted, "yes", "earns_by_violating"),
