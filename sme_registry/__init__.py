@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from sme_registry.evaluation import EvaluationReport, StreamReport, evaluate
     from sme_registry.evaluation.values import values
     from sme_registry.export import export_onnx
+    from sme_registry.profiles.document import Profile
+    from sme_registry.profiles.run import profile
     from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
     from sme_registry.studies import compare, run_study
     from sme_registry.studies import load as load_study
@@ -56,6 +58,7 @@ if TYPE_CHECKING:
 __all__ = [
     "EvaluationProtocol",
     "EvaluationReport",
+    "Profile",
     "SMEError",
     "SMESpec",
     "StreamReport",
@@ -74,6 +77,7 @@ __all__ = [
     "make_parallel",
     "make_vec",
     "materialize",
+    "profile",
     "register",
     "run_study",
     "save",
@@ -85,6 +89,7 @@ __all__ = [
 _LAZY = {
     "EvaluationProtocol": "sme_registry.spec.EvaluationProtocol",
     "EvaluationReport": "sme_registry.evaluation.EvaluationReport",
+    "Profile": "sme_registry.profiles.document.Profile",
     "SMESpec": "sme_registry.spec.SMESpec",
     "StreamReport": "sme_registry.evaluation.StreamReport",
     "StreamSpec": "sme_registry.spec.StreamSpec",
@@ -97,6 +102,7 @@ _LAZY = {
     "load_study": "sme_registry.studies.load",
     "make_dataset": "sme_registry.datasets.make_dataset",
     "materialize": "sme_registry.task.materialize",
+    "profile": "sme_registry.profiles.run.profile",
     "run_study": "sme_registry.studies.run_study",
     "save": "sme_registry.task.loading.save",
     "train": "sme_registry.training.train",

@@ -21,6 +21,7 @@ CONTRACT = {
     "materialize", "make", "make_vec", "make_parallel", "make_aec", "env_spec", "evaluate",
     "EvaluationReport", "StreamReport", "train", "train_offline", "make_dataset", "export_onnx",
     "diagnose", "run_study", "load_study", "compare", "SMEError", "values",
+    "Profile", "profile",
 }  # fmt: skip
 
 

@@ -20,6 +20,7 @@ QUANTITIES = {
     "wd_regret": "N₀, normalised regret in WD",
     "ood_regret": "N̄, mean of normalised regret over the OOD shells",
     "ood_decay": "mean over the OOD shells of (r̃_WD − r̃_m)/r̃_WD; on boards of rules 2 N̄ − N₀",
+    "steps_to_half": "steps before the first evaluation during training with N₀ ≤ ½",
     "regret_slope": "slope of normalised regret over the shells' ε",
     "similarity_decay": "(r̃_WD − r̃_m)/r̃_WD",
     "similarity_loss": "100 (r̃_WD − r̃_m), points",

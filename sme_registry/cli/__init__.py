@@ -21,6 +21,7 @@ class _Commands(CommandGroup):
         "evaluate": (f"{__name__}.evaluate", "Evaluate a policy in and out of distribution."),
         "diagnose": (f"{__name__}.evaluate", "Show where a policy's regret occurs, and why."),
         "explore": (f"{__name__}.evaluate", ""),
+        "profile": (f"{__name__}.profile", "Show where an algorithm breaks, beside PPO."),
         "study": (f"{__name__}.study", "Compare algorithms on classes of tasks, over seeds."),
         "data": (f"{__name__}.data", "Make data sets for offline RL, of a chosen quality."),
         "demo": (f"{__name__}.train", "Train, evaluate and draw, in less than a minute."),

@@ -207,6 +207,9 @@ class _Training(_Evaluations):
         self._evaluate_due(steps)
         self.report(steps)
 
+    def on_policy(self) -> None:
+        self._evaluate_due(self._learner.steps, yielded=True)
+
     def on_visit(self, visit: int) -> None:
         """Keep the policy at the end of a visit; of visit −1 that before training."""
         self._policies.append(self._learner.lasting_policy())
@@ -223,9 +226,11 @@ class _Training(_Evaluations):
             report = life_report(self.cell, visits, initial, blocks.dynamic_regret())
         return self.result_of(report, learner.steps, learner.seconds)
 
-    def _evaluate_due(self, steps: int) -> None:
+    def _evaluate_due(self, steps: int, *, yielded: bool = False) -> None:
         """Run the evaluations that are due during training; the last one waits for its end."""
         record = self.record
+        if yielded != self._learner.yields_policies:
+            return
         while record.evaluated + 1 < len(record.due) and record.due[record.evaluated] <= steps:
             record.spend(TRAINING)
             self.evaluate(steps, self._learner.policy())

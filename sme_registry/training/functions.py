@@ -7,7 +7,8 @@
 `env` is a Gymnasium environment of one task, with the exact regret of each step in its info.
 Hyperparameters are keyword arguments. The policy acts in the environment's action space; a model
 with `predict`, as those of Stable-Baselines3, and a PyTorch module are policies, too. It is
-evaluated once, at the end of its training.
+evaluated once, at the end of its training. A function with `yield policy` in it, at any time and as
+often as it likes, is evaluated during training too; the last policy is that of the run.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import importlib.util
 import inspect
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from sme_registry.training.algorithms import arguments_of, parse_uses
 from sme_registry.training.learn import Learner, Run, Steps, Watch
 
 _loaded: dict[str, str] = {}  # the digest of the source that a module has run
+_in_memory: dict[str, Callable[..., Any]] = {}  # functions of a notebook, by their names
 
 
 def settings(name: str, field: str) -> type[StrictModel]:
@@ -47,6 +49,41 @@ def source_of(uses: str, field: str = "uses") -> str | None:
     return _source(name, field)[1] if kind == "train" else None
 
 
+def keep_in_memory(function: Callable[..., Any]) -> str:
+    """The `uses` of a function that no module file has, such as one of a notebook, in this process.
+
+    The digest of its source is that of the function alone.
+    """
+    name = f"__main__:{function.__name__}"
+    try:
+        inspect.getsource(function)
+    except OSError:
+        raise OptionError(
+            f"{name}: has no source, by which its results are known. Define it in a file."
+        ) from None
+    _in_memory[name] = function
+    return f"train:{name}"
+
+
+def is_in_memory(uses: str) -> bool:
+    """Whether the function of `uses` is only in this process."""
+    return parse_uses(uses)[1] in _in_memory
+
+
+def check_signature(
+    name: str, function: Callable[..., Any], hyperparameters: Mapping[str, Any], field: str = "uses"
+) -> None:
+    """Check that a function can be called with an environment, steps, a seed and these."""
+    try:
+        inspect.signature(function).bind(None, 1, 0, **hyperparameters)
+    except TypeError as error:
+        raise OptionError(
+            f"{field}='train:{name}': cannot be called with an environment, steps, a seed and the "
+            f"hyperparameters {sorted(hyperparameters)}: {error}. Define "
+            f"{name.partition(':')[2]}(env, steps, seed), and hyperparameters by name."
+        ) from None
+
+
 def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
     """The function `module:function` of the present source, and the source's digest.
 
@@ -55,6 +92,8 @@ def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], s
     module_name, _, attribute = name.partition(":")
     with working_directory_importable():
         path, digest, source = _source(name, field)
+        if name in _in_memory:
+            return _in_memory[name], digest
         module = sys.modules.get(module_name)
         try:
             if module is None or _loaded.get(module_name) != digest:
@@ -84,36 +123,34 @@ def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], s
 def _source(name: str, field: str) -> tuple[str, str, bytes]:
     """The path, the digest and the bytes of a module's source, which is not imported."""
     module = name.partition(":")[0]
+    if name in _in_memory:
+        return module, *_digested(inspect.getsource(_in_memory[name]).encode())
     path = module_file(module)
     if not path or not path.endswith(".py"):
         raise OptionError(
             f"{field}='train:{name}': there is no Python module {module!r}. It must be "
             "train:module:function, with the module in the working directory or installed."
         )
-    source = Path(path).read_bytes()
-    return path, f"sha256:{hashlib.sha256(source).hexdigest()}", source
+    return path, *_digested(Path(path).read_bytes())
+
+
+def _digested(source: bytes) -> tuple[str, bytes]:
+    return f"sha256:{hashlib.sha256(source).hexdigest()}", source
 
 
 class FunctionLearner(Learner):
     """A function `train(env, steps, seed) -> policy` in its environment."""
 
-    only_at_the_end = True
-
     def __init__(self, name: str, run: Run) -> None:
         super().__init__(name, run)
         self._named = f"{run.field}='train:{name}'"
         self._function, self.source = load_function(name, run.field)
+        check_signature(name, self._function, self.hyperparameters, run.field)
+        self.yields_policies = inspect.isgeneratorfunction(self._function)
+        self.only_at_the_end = not self.yields_policies
         env = SMEEnv(run.document, action_range=run.action_range)
         self._env = _LimitedEnv(env, run.steps, self._named)
         self.model: Any = None
-        try:
-            inspect.signature(self._function).bind(env, run.steps, run.seed, **self.hyperparameters)
-        except TypeError as error:
-            raise OptionError(
-                f"{self._named}: cannot be called with an environment, steps, a seed and the "
-                f"hyperparameters {sorted(self.hyperparameters)}: {error}. Define "
-                f"{name.partition(':')[2]}(env, steps, seed), and hyperparameters by name."
-            ) from None
 
     @property
     def steps(self) -> int:
@@ -131,16 +168,23 @@ class FunctionLearner(Learner):
         run, self._env.on_steps = self.run, watch.on_steps
         self._env.reset(seed=run.seed)  # so that episodes without a seed are reproducible
         with working_directory_importable():
-            self.model = self._function(self._env, run.steps, run.seed, **self.hyperparameters)
-        is_policy = callable(self.model) or hasattr(self.model, "predict")
-        if not is_policy or isinstance(self.model, type):
-            document = run.document
+            trained = self._function(self._env, run.steps, run.seed, **self.hyperparameters)
+            for policy in trained if self.yields_policies else ():
+                self.model = self._checked(policy)
+                watch.on_policy()
+        self.model = self._checked(self.model if self.yields_policies else trained)
+
+    def _checked(self, model: Any) -> Any:
+        is_policy = callable(model) or hasattr(model, "predict")
+        if not is_policy or isinstance(model, type):
+            document = self.run.document
             raise PolicyError(
-                f"{self._named}: returned {self.model!r:.80}: must be a policy. Return a function "
+                f"{self._named}: returned {model!r:.80}: must be a policy. Return a function "
                 f"from observations [B, {document.observation_dim}] to actions "
                 f"[B, {document.action_dim}], or a model with predict, as those of "
                 "Stable-Baselines3."
             )
+        return model
 
     def save(self, path: Path) -> None:
         kinds = sys.modules.get("stable_baselines3.common.base_class")

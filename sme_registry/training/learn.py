@@ -75,6 +75,9 @@ class Watch:
     def on_visit(self, visit: int) -> None:
         """A visit of a stream's phase has ended."""
 
+    def on_policy(self) -> None:
+        """A learner that yields policies has another one."""
+
     def on_pause(self) -> None:
         """The learner has learned from all its steps: a checkpoint may be saved."""
 
@@ -92,12 +95,14 @@ class Learner:
       source: the digest of the source of the code that learns, if that is part of a cell.
       seconds: CPU seconds in its environments, if they are known.
       only_at_the_end: whether it has no policy before.
+      yields_policies: whether it has another policy only where it calls `Watch.on_policy`.
       model: the trained policy, as `evaluate` takes it.
     """
 
     source: str | None = None
     seconds: Any = 0.0
     only_at_the_end = False
+    yields_policies = False
     steps: Any
     total: Any
     model: Any

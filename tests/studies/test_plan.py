@@ -38,6 +38,7 @@ MADE_BY = {
     ),
 }  # fmt: skip
 OFFLINE = "offline-quality"
+PROFILE = "profile"  # whose levels `tests/profiles` compares with the catalogue's
 
 
 def offline_quality():
@@ -89,7 +90,7 @@ def refused(*arguments):
 
 class TestCatalogue:
     def test_every_plan_is_made_by_a_command_that_is_written_down(self):
-        assert {file.name for file in catalogue.entries(StudyFile)} == {*MADE_BY, OFFLINE}
+        assert {file.name for file in catalogue.entries(StudyFile)} == {*MADE_BY, OFFLINE, PROFILE}
 
     @pytest.mark.parametrize("name", MADE_BY)
     def test_a_plan_is_what_its_command_writes(self, name):

@@ -1,0 +1,389 @@
+"""`Profile`: where an algorithm breaks, as facts, and what follows from them.
+
+It is a study, whose plan is `profile-v1` with the one algorithm: the default and two harder levels
+of each of nine axes, with some draws of each.
+
+    N₀          WD regret: 0 for the optimum, 1 for the constant ½; a level's is the IQM over draws
+    1 − N₀      performance
+    robustness  of an axis: mean over its harder levels of  (1 − N₀ there) / (1 − N₀ at its base),
+                what is kept of the performance; unknown where N₀ at the base is at least `UNLEARNT`
+    N₀ ≤ ½      at the first evaluation during training in whose episodes the mean |a − a*| is at
+                most half of that of the constant ½
+
+Intervals are the 95 % bootstrap intervals of `statistics` over draws. Two algorithms are compared
+in pairs: on the same draw of a level with the same seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, Self
+
+import numpy as np
+
+from sme_registry.io import read_json, to_json, write_atomically
+from sme_registry.io.markup import Table, card, conjunction, fixed, signed, table_html
+from sme_registry.spec import StudyAlgorithm, StudyFile, catalogue
+from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
+from sme_registry.spec.study import PlannedCell
+from sme_registry.statistics import Array, iqm
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, Bootstrap
+from sme_registry.studies.report.design import METRICS
+from sme_registry.studies.report.findings import THRESHOLDS
+from sme_registry.studies.report.tables import paired
+from sme_registry.studies.result import CellFailure, CellResult
+
+PLAN = "profile"
+DEFAULT, TWO_LAYERS = "default", "complexity-2"
+UNLEARNT = THRESHOLDS["unlearnt"]
+DIGITS = 6
+_HALF = 0.5
+_COMPARED = ("PPO", "TD3", "SAC")  # in sentences; others are in figures and tables
+
+
+class Axis(NamedTuple):
+    """What its levels change, and they by the names of their classes, the base first."""
+
+    label: str
+    levels: Mapping[str, str]
+
+    @property
+    def base(self) -> str:
+        return next(iter(self.levels))
+
+    @property
+    def harder(self) -> list[str]:
+        return [*self.levels][1:]
+
+
+def _axis(label: str, stem: str, values: str, base: str = DEFAULT) -> Axis:
+    first, *harder = values.split()
+    names = {f"{stem}-{value.replace('.', '_')}": value for value in harder}
+    return Axis(label, {base: first, **names})
+
+
+AXES = (
+    _axis("state dimension S", "state_dim", "8 16 64"),
+    _axis("action dimension A", "action_dim", "4 8 16"),
+    _axis("reward interval k", "k", "1 5 25"),
+    _axis("reward threshold r_min", "r_min", "0 0.5 0.75"),
+    _axis("survival threshold D", "D", "0 0.25 0.5"),
+    _axis("complexity L", "complexity", "1 2 10"),
+    _axis("foresight, scale of shaping", "shaping-scale", "0 10 30", TWO_LAYERS),
+    _axis("noise of the reward σ", "noise-reward", "0 0.3 1", TWO_LAYERS),
+    _axis("distractors", "observation-distractors", "0 8 32"),
+)
+
+
+def plan_file() -> StudyFile:
+    return catalogue.find(StudyFile, PLAN)
+
+
+class ProfileRow(StrictModel):
+    """A finished run; numbers have six decimals.
+
+    Attributes:
+      class_name: the level, a class of the plan.
+      run: the number of the draw, from 0, which is also the seed of training.
+      wd_regret: N₀.
+      ood_regret: N̄, the mean of normalised regret over the shells around the cube.
+      ood_decay: the share of similarity that is lost in the shells.
+      online_regret: mean over all steps of training; null of what does not train.
+      evaluations: during training, at its end included.
+      steps_to_half: steps before the first evaluation with N₀ ≤ ½; null if there was none.
+    """
+
+    class_name: str
+    run: Integer
+    wd_regret: Real
+    ood_regret: Real
+    ood_decay: Real
+    online_regret: Real | None
+    evaluations: Integer
+    steps_to_half: Integer | None
+
+
+class ProfileFailure(StrictModel):
+    """A run that raised an error.
+
+    Attributes:
+      class_name: the level.
+      run: the number of the draw.
+      error: the message.
+    """
+
+    class_name: str
+    run: Integer
+    error: str
+
+
+class Estimate(NamedTuple):
+    """A number over draws with its 95 % interval; NaN where it is unknown."""
+
+    value: float
+    low: float
+    high: float
+    draws: int
+
+    def __str__(self) -> str:
+        if math.isnan(self.value):
+            return "–"
+        ends = "" if math.isnan(self.low) else f" [{fixed(self.low)}, {fixed(self.high)}]"
+        return fixed(self.value) + ends
+
+
+class Contrast(NamedTuple):
+    """The difference of N₀ of two algorithms over pairs of runs, and the verdict on the first."""
+
+    value: float
+    low: float
+    high: float
+    pairs: int
+    verdict: str
+
+    def __str__(self) -> str:
+        ends = "" if math.isnan(self.low) else f" [{fixed(self.low)}, {fixed(self.high)}]"
+        return f"{signed(self.value)}{ends}"
+
+
+class Profile(StrictModel):
+    """Where an algorithm breaks: its regret on the default and on harder levels of nine axes.
+
+    `print(profile)` shows a row for each axis, `profile.sentences()` compares it with the reference
+    algorithms, and its page is in the folder of `sme_registry.profile`.
+
+    Attributes:
+      schema_version: version of the format.
+      algorithm: what was trained; its name is that of the profile.
+      plan: the name of the plan of levels and draws.
+      plan_digest: its digest; profiles of one plan and as many steps can be compared.
+      protocol_digest: of the evaluation in and outside the cube.
+      steps: of training, in each run.
+      seeds: draws of each level.
+      classes: the levels that were asked for.
+      rows: finished runs.
+      failures: runs that failed.
+      versions: of the packages that the numbers depend on.
+
+    Examples:
+      >>> from sme_registry import Profile
+      >>> ppo = Profile.references()["PPO"]
+      >>> ppo.level("default").value < ppo.level("noise-reward-1").value
+      True
+    """
+
+    schema_version: Literal[1] = 1
+    algorithm: StudyAlgorithm
+    plan: str
+    plan_digest: Digest
+    protocol_digest: Digest
+    steps: Integer
+    seeds: Integer
+    classes: TupleOf[str]
+    rows: TupleOf[ProfileRow]
+    failures: TupleOf[ProfileFailure] = ()
+    versions: dict[str, str]
+
+    @classmethod
+    def read(cls, path: Any) -> Self:
+        """Read a file that `write` wrote."""
+        return cls.from_dict(read_json(path), str(path))
+
+    def write(self, path: Any) -> Any:
+        """Write it as JSON, completely or not at all; returns the path."""
+        return write_atomically(path, to_json(self.to_dict()))
+
+    @classmethod
+    def references(cls) -> dict[str, Self]:
+        """The profiles that the package has, by name: PPO first."""
+        paths = (catalogue.spec_folder() / "profiles").glob("*.json")
+        known = {profile.name: profile for profile in map(cls.read, paths)}
+        order = [algorithm.name for algorithm in plan_file().plan.algorithms]
+        return {name: known[name] for name in sorted(known, key=order.index)}
+
+    @property
+    def name(self) -> str:
+        """The algorithm's name."""
+        return self.algorithm.name
+
+    def comparable(self, others: Iterable[Profile]) -> list[Profile]:
+        """Those with the same levels, draws and steps, without another of the same algorithm."""
+        mine = self.algorithm.uses, self.algorithm.hyperparameters
+        return [
+            other
+            for other in others
+            if other.plan_digest == self.plan_digest
+            and (other.steps == self.steps or not other.learns)
+            and (other.algorithm.uses, other.algorithm.hyperparameters) != mine
+        ]
+
+    @property
+    def learns(self) -> bool:
+        return self.algorithm.steps != 0
+
+    def values(self, class_name: str, field: str = "wd_regret") -> dict[int, float]:
+        """A number of each run on a level that has it, by run."""
+        rows = (row for row in self.rows if row.class_name == class_name)
+        numbers = {row.run: getattr(row, field) for row in rows}
+        return {run: value for run, value in numbers.items() if value is not None}
+
+    def level(self, class_name: str, field: str = "wd_regret") -> Estimate:
+        """The IQM over the draws of a level."""
+        values = self.values(class_name, field)
+        runs = np.array([[value] for value in values.values()])
+        return self._estimate(runs, iqm, "level", class_name, field)
+
+    def robustness(self, axis: Axis) -> Estimate:
+        """What is kept of the performance at the harder levels, over draws that have all levels."""
+        levels = [self.values(name) for name in (axis.base, *axis.harder) if self.values(name)]
+        complete = set[int].intersection(*map(set, levels)) if len(levels) > 1 else set()
+        known = axis.base in self.classes and len(levels) == len(self._asked(axis))
+        runs = np.array([[of[run] for of in levels] for run in sorted(complete if known else ())])
+        if len(runs) and float(iqm(runs)[0]) >= UNLEARNT:
+            runs = runs[:0]
+        return self._estimate(runs, _kept, "robustness", axis.base, *axis.harder)
+
+    def _asked(self, axis: Axis) -> list[str]:
+        return [name for name in axis.levels if name in self.classes]
+
+    def _estimate(self, runs: Array, statistic: Callable[[Any], Array], *place: str) -> Estimate:
+        if not len(runs):
+            return Estimate(math.nan, math.nan, math.nan, 0)
+        bootstrap = Bootstrap(self.plan_digest)
+        ends = bootstrap.interval({"": runs}, "profile", *place, statistic=statistic)
+        return Estimate(float(statistic(runs)[0]), *ends, len(runs))
+
+    def steps_to_half(self, class_name: str = DEFAULT) -> float | None:
+        """The median over draws; infinite where it was not reached, None if it is unknown."""
+        rows = [row for row in self.rows if row.class_name == class_name]
+        if not rows or any(row.evaluations < 2 and self.learns for row in rows):
+            return None
+        steps = [math.inf if row.steps_to_half is None else row.steps_to_half for row in rows]
+        return float(np.quantile(steps, 0.5, method="higher"))
+
+    def against(self, other: Profile, names: Sequence[str]) -> Contrast | None:
+        """The difference of N₀ from another profile's over levels; None without a pair."""
+        pairs = {name: self._pairs(other, name) for name in names}
+        pairs = {name: both for name, both in pairs.items() if len(both)}
+        if not pairs:
+            return None
+        place = "profile", other.name, *pairs
+        *_, value, low, high, count, _, verdict = paired(
+            pairs, METRICS["wd_regret"], Bootstrap(self.plan_digest), *place
+        )
+        return Contrast(value, low, high, count, verdict)
+
+    def _pairs(self, other: Profile, name: str) -> Array:
+        ours, theirs = self.values(name), other.values(name)
+        both = [[ours[run], theirs[run]] for run in sorted(ours.keys() & theirs.keys())]
+        return np.array(both).reshape(-1, 2)
+
+    def contrasts(self, other: Profile) -> dict[str, Contrast]:
+        """The differences on the default, and over the harder levels of each axis, by label."""
+        places = {"the default": [DEFAULT]} | {axis.label: axis.harder for axis in AXES}
+        known = {label: self.against(other, names) for label, names in places.items()}
+        return {label: contrast for label, contrast in known.items() if contrast is not None}
+
+    def sentences(self, others: Iterable[Profile] | None = None) -> list[str]:
+        """Where it breaks, how fast it learns, and where it is better or worse than PPO, TD3, SAC.
+
+        `others` are the profiles it is compared with, by default `references()`.
+        """
+        known = self.comparable(Profile.references().values() if others is None else others)
+        compared = [other for other in known if other.name in _COMPARED]
+        return [*self._breaks(), self._speed(), *map(self._comparison, compared)]
+
+    def _breaks(self) -> list[str]:
+        kept = {axis.label: self.robustness(axis) for axis in AXES}
+        kept = {label: each for label, each in kept.items() if not math.isnan(each.value)}
+        if not kept:
+            return [f"{self.name} learnt too little to lose anything: no robustness is known."]
+        least, most = (f(kept, key=lambda label: kept[label].value) for f in (min, max))
+        text = f"{self.name} breaks most along {least}: it keeps {kept[least]} of its performance"
+        return [f"{text}. Least of all it is hurt along {most}: {kept[most]}."]
+
+    def _speed(self) -> str:
+        default, half = self.level(DEFAULT), self.steps_to_half()
+        text = f"On the default its N₀ is {default} after {self.steps:,} steps"
+        if half is None:
+            return f"{text}; when it fell to ½ is unknown, as it was evaluated at the end alone."
+        if math.isinf(half):
+            return f"{text}; in most draws it never fell to ½."
+        return f"{text}; it fell to ½ after {half:,.0f} steps, in the median over draws."
+
+    def _comparison(self, other: Profile) -> str:
+        parts, contrasts = [], self.contrasts(other)
+        for verdict in ("better", "worse", "indication"):
+            of = {label: each for label, each in contrasts.items() if each.verdict == verdict}
+            if of:
+                ordered = sorted(of, key=lambda label: -abs(of[label].value))
+                texts = [f"{label} ({of[label]})" for label in ordered[:3]]
+                more = [f"{len(of) - 3} more"] if len(of) > 3 else []
+                word = "an indication only on" if verdict == "indication" else f"{verdict} on"
+                parts.append(f"{word} {conjunction([*texts, *more])}")
+        still = sum(each.verdict == "open" for each in contrasts.values())
+        if still:
+            parts.append(f"open on {still} of {len(contrasts)}")
+        return f"Against {other.name}, by the difference of N₀: {'; '.join(parts)}."
+
+    def table(self) -> Table:
+        """A row for each axis: its levels, N₀ at each, and the robustness."""
+        records = []
+        for axis in AXES:
+            levels = [self.level(name) for name in axis.levels]
+            regret = (fixed(each.value) if each.draws else "–" for each in levels)
+            records.append(
+                {
+                    "axis": axis.label,
+                    "levels": " → ".join(axis.levels.values()),
+                    "N₀": " → ".join(regret),
+                    "robustness": str(self.robustness(axis)),
+                }
+            )
+        draws = f"{self.steps:,} steps, {len(self.rows)} of {self.planned} runs"
+        caption = f"IQM over draws. Fewer than {ENOUGH_RUNS} draws are an indication only."
+        return Table.of(f"[bold]{self.name}[/]  {draws}", records, caption=caption)
+
+    @property
+    def planned(self) -> int:
+        """How many runs it has if it is complete."""
+        return len(self.classes) * self.seeds
+
+    def __str__(self) -> str:
+        from sme_registry.evaluation.report import as_text
+
+        return as_text(self.table())
+
+    def _repr_html_(self) -> str:
+        return card(table_html(self.table()), *(f"<p>{text}</p>" for text in self.sentences()))
+
+
+def _kept(runs: Any) -> Array:
+    """Robustness `[…, 1]` of N₀ `[n, …, 1 + levels]`, the base first."""
+    performance = 1.0 - iqm(runs)
+    kept = performance[..., 1:] / performance[..., :1]
+    return np.asarray(kept.mean(axis=-1, keepdims=True))
+
+
+def row_of(planned: PlannedCell, result: CellResult) -> ProfileRow:
+    """The row of a finished cell."""
+    report, curve = result.report, result.curve
+    assert report is not None  # the plan has no streams
+    constant = 1.0 - report.references["constant"][0].similarity
+    reached = (1.0 - np.array(curve.similarity)) <= _HALF * constant
+    online = result.online_regret
+    return ProfileRow(
+        class_name=planned.class_name,
+        run=planned.run,
+        wd_regret=round(report.wd_regret, DIGITS),
+        ood_regret=round(report.ood_regret, DIGITS),
+        ood_decay=round(report.ood_decay, DIGITS),
+        online_regret=None if online is None else round(online, DIGITS),
+        evaluations=len(curve.steps),
+        steps_to_half=curve.steps[int(reached.argmax())] if reached.any() else None,
+    )
+
+
+def failure_of(planned: PlannedCell, failure: CellFailure) -> ProfileFailure:
+    return ProfileFailure(class_name=planned.class_name, run=planned.run, error=failure.error[:500])
