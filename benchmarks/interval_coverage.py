@@ -87,7 +87,7 @@ def simulate(
     """Simulate equal methods and compute the interval of each.
 
     The columns that `bootstrap` treats as metrics are independent methods here. The strata are
-    those of `leaderboard.scoring.aggregation`.
+    those of `leaderboard.scoring.ranking`.
     """
     rng = np.random.default_rng(0)
     runs = RUNS // instances

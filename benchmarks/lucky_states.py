@@ -14,7 +14,7 @@ import numpy as np
 
 from leaderboard.documents.submission import Submission
 from leaderboard.gate.sandbox import Sandbox
-from leaderboard.scoring.aggregation import run_metrics
+from leaderboard.scoring.ranking import run_metrics
 from leaderboard.store import Store
 from sme_registry import evaluate
 

@@ -47,7 +47,7 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation, isolation_for_own
-from leaderboard.gate.reference import constant_onnx, optimal_onnx
+from leaderboard.gate.networks import constant_onnx, optimal_onnx
 from leaderboard.gate.sandbox import Confined, widths
 from leaderboard.store import Store, expire_uploads, unknown_submission
 from sme_registry.io import sha256_of
@@ -189,7 +189,7 @@ def admit(
             _check_queue(store)
         for digest, declared in _policies(submission).items():  # nor can `gc` take a file
             if policy_file is not None:
-                store.put_object(digest, [policy_file(digest)], by=key)
+                store.put_object(digest, policy_file(digest), by=key)
             check_stored(store, key, declared)
         return store.receive(signed)
 

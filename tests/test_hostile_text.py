@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import leaderboard.cli
 import sme_registry.cli
-from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from sme_registry.io.system import hidden_in
 from sme_registry.io.terminal import log_to_terminal

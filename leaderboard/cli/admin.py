@@ -15,34 +15,46 @@ from rich.markup import escape
 from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.cli import results
-from leaderboard.cli.options import (
-    DEFAULT_KEY,
-    WITH_SEASONS,
-    Board,
-    BoardFolder,
-    Json,
-    KeyFile,
-    NewBoardFolder,
-    SuiteName,
-    complete_protocol,
-    find_suite,
-    open_board,
-    own_key,
-)
+from leaderboard.cli.results import WITH_SEASONS, Board, BoardFolder, Json, is_url, open_board
+from leaderboard.cli.submit import DEFAULT_KEY, KeyFile, SuiteName, find_suite, own_key
 from leaderboard.documents.board import RUNS_TO_RANK, Folder
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import Isolation, available_isolation, isolation_for_own
 from leaderboard.scoring.worker import Work, run_scorers
 from leaderboard.store import collect_garbage
-from leaderboard.web import server
 from leaderboard.web.pages import Section
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
+from sme_registry.io import require_packages
 from sme_registry.io.markup import plural
 from sme_registry.io.terminal import Progress, err, out, print_json, print_line, print_note
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, Suite, SuiteFile, catalogue
 from sme_registry.training import RunRecord
+
+
+def new_board_folder(board: str | Path) -> Path:
+    """The folder of a board to create, which is not the name of a suite."""
+    name = str(board)
+    if is_url(name) or Path(board).is_file():
+        raise OptionError(
+            f"{name!r}: must be a folder on this machine. To serve a board at a URL, create it and "
+            "run `sme-leaderboard serve`; for a suite's file, `sme-leaderboard init board --suite "
+            "FILE`."
+        )
+    if any(name in (file.name, file.versioned_name) for file in catalogue.entries(SuiteFile)):
+        raise OptionError(
+            f"{name!r}: must be a folder, and is a suite. Give `board --suite {name}`; for a "
+            f"folder of this name, .{os.sep}{name}"
+        )
+    return Path(board)
+
+
+NewBoardFolder = Annotated[
+    Path, typer.Argument(metavar="BOARD", help="The board's new folder.", parser=new_board_folder)
+]
+complete_protocol = catalogue.completion(ProtocolFile)
+
 
 app = typer.Typer()
 admin = typer.Typer(no_args_is_help=True)
@@ -165,8 +177,6 @@ def score(
 
 
 def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
-    """Score all waiting submissions of a board, and print what became of them."""
-
     with Board.open(board) as store:
         entries = store.entries()
     before = {entry.id for entry in entries if entry.status != "waiting"}
@@ -230,6 +240,8 @@ def site(
 
         sections.append(SECTION)
 
+    from leaderboard.web import server  # which imports FastAPI
+
     target = board / "site" if out_folder is None else out_folder
     with open_board(board) as store:
         total = len(store.entries())
@@ -283,7 +295,11 @@ def serve(
       sme-leaderboard serve board --url https://board.example
     """
     Folder(board).read()  # a wrong folder fails before anything listens
-    server.serve(
+    libraries = {"fastapi": "FastAPI", "uvicorn": "uvicorn"}
+    require_packages("serving a board", libraries, "leaderboard")
+    from leaderboard.web import app
+
+    app.serve(
         board,
         host=host,
         port=port,
@@ -377,11 +393,12 @@ def gc(
         garbage = collect_garbage(
             store, objects_older_than=older_than_hours * 3600.0, dry_run=dry_run
         )
+    files = garbage.temporary + garbage.objects
     if json:
-        print_json({"files": garbage.files, "bytes": garbage.bytes, "dry_run": dry_run})
+        print_json({"files": files, "bytes": garbage.bytes, "dry_run": dry_run})
         return
     verb = "Would remove" if dry_run else "Removed"
-    out().print(f"{verb} {garbage.files:,} files, {garbage.bytes / 2**20:,.1f} MiB.")
+    out().print(f"{verb} {files:,} files, {garbage.bytes / 2**20:,.1f} MiB.")
 
 
 _FOLDERS = ("bundle", "site", "board")  # removed in this order: the board identifies the others
@@ -428,8 +445,6 @@ def demo(
 
 
 def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
-    """Create a board for a run's task, and submit the run."""
-
     setting = record.spec.to_dict()
     seed = setting.pop("seed")
     suite = Suite.from_dict({"classes": [{"name": _SUITE, "setting": setting, "seeds": [seed]}]})
@@ -459,7 +474,6 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
 
 
 def _refuse_other_files(folder: Path) -> None:
-    """Refuse a folder with files that no demonstration created."""
     existing = [folder / name for name in sorted(_FOLDERS) if os.path.lexists(folder / name)]
     if existing and not _is_demonstration(folder / "board"):
         raise OptionError(
@@ -480,7 +494,5 @@ def _is_demonstration(path: Path) -> bool:
 
 
 def _name_of(protocol: EvaluationProtocol) -> str:
-    """The protocol's name in the catalogue, or "custom"."""
-
     known = {file.digest: file.versioned_name for file in catalogue.entries(ProtocolFile)}
     return known.get(protocol.digest, "custom")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal
@@ -13,16 +15,7 @@ from typing import Annotated, Literal
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import (
-    WITH_SEASONS,
-    Board,
-    BoardFolder,
-    BoardOrUrl,
-    Json,
-    SubmissionId,
-    is_url,
-    open_board,
-)
+from leaderboard.documents.board import Folder
 from leaderboard.documents.result import METRICS, RANKED, Estimate, Metric, Result
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError
@@ -32,20 +25,93 @@ from leaderboard.scoring.verify import VerifyReport
 from leaderboard.scoring.verify import verify as verify_board
 from leaderboard.store import EntryRow, Store
 from leaderboard.web import client
-from leaderboard.web.client import MOST_BYTES
+from leaderboard.web.client import MOST_BYTES, PublicView, public_view
 from leaderboard.web.client import fetch as fetch_board
-from leaderboard.web.tables import PublicView, RankingFile, public_view, steps_text
+from leaderboard.web.tables import RankingFile, steps_text
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import err, fixed, out, print_json, print_line, print_pairs
+from sme_registry.io.terminal import (
+    Progress,
+    err,
+    fixed,
+    out,
+    print_json,
+    print_line,
+    print_pairs,
+)
+
+WITH_SEASONS = find_spec("leaderboard.seasons") is not None
+Board: type[Store] = Store
+"""How boards are opened: with seasons, if this package has them."""
 
 if WITH_SEASONS:
-    from leaderboard.seasons.publication import files_of_seasons
-    from leaderboard.seasons.verify import verify_seasons
+    from leaderboard.seasons.publication import files_of_seasons, verify_seasons
+    from leaderboard.seasons.store import SeasonStore
+
+    Board = SeasonStore
 
 app = typer.Typer()
 
 _SHORTEST_ID = 4
+_LONG_LOG = 2000  # entries, read in two seconds or so
+
+
+def is_url(board: str) -> bool:
+    """Whether a board is given by its URL."""
+    return "://" in board
+
+
+def board_folder(board: str | Path) -> Path:
+    """The folder of a board on this machine."""
+    path = Path(board)
+    if is_url(str(board)):
+        raise OptionError(
+            f"{str(board)!r}: must be a board's folder: this command reads its files. Open the URL "
+            "in a browser for the ranking. `submit`, `show` and `withdraw` accept a URL."
+        )
+    if not path.is_dir():
+        raise OptionError(
+            f"{str(board)!r}: no such folder. Give the folder that contains board.json, or for a "
+            "served board its whole URL. `sme-leaderboard init` creates a board."
+        )
+    return path
+
+
+def open_board(board: Path) -> Store:
+    """Open a board read-only; a bar shows the progress if its log is long."""
+
+    log = Folder(board).log
+    entries = sum(1 for _ in os.scandir(log)) if log.is_dir() else 0
+    with Progress(
+        "reading", entries, console=err(), unit="log entries", enabled=entries > _LONG_LOG
+    ) as progress:
+        return Board.open(board, read_only=True, progress=progress.update)
+
+
+def board_or_url(board: str) -> str:
+    """A board's folder or the URL of a served board, as it is given."""
+    return board if is_url(board) else str(board_folder(board))
+
+
+BoardFolder = Annotated[
+    Path, typer.Argument(metavar="BOARD", help="The board's folder.", parser=board_folder)
+]
+BoardOrUrl = Annotated[
+    str,
+    typer.Argument(
+        metavar="BOARD",
+        help="A board's folder, or the URL of a served board.",
+        parser=board_or_url,
+    ),
+]
+SubmissionId = Annotated[
+    str,
+    typer.Argument(
+        metavar="ID",
+        help="The submission's id: in full for a URL; its first digits suffice for a folder.",
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @app.command()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -14,27 +15,9 @@ from rich.markup import escape
 from leaderboard import admission
 from leaderboard.admission import check_submission
 from leaderboard.bundle import Bundle, make_bundle
-from leaderboard.cli.options import (
-    ADVANCED,
-    DEFAULT_KEY,
-    Board,
-    BoardOrUrl,
-    CodeLink,
-    Family,
-    Json,
-    KeyFile,
-    MethodVersion,
-    Statement,
-    SubmissionId,
-    board_document,
-    is_url,
-    method_name,
-    own_key,
-    receiver_of,
-    submitter_name,
-)
-from leaderboard.cli.results import find_entry
-from leaderboard.documents.board import BoardDocument
+from leaderboard.cli.results import Board, BoardOrUrl, Json, SubmissionId, find_entry, is_url
+from leaderboard.documents.board import FILE as BOARD
+from leaderboard.documents.board import BoardDocument, Folder, refuse_unscored
 from leaderboard.documents.result import RANKED, Result
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import FILE, Knowledge, Withdrawal, now
@@ -44,6 +27,86 @@ from leaderboard.scoring.score import score_submission
 from leaderboard.web import client
 from sme_registry.errors import OptionError
 from sme_registry.io.terminal import Progress, err, out, print_json, print_line, print_note
+from sme_registry.spec import SuiteFile, catalogue
+
+KEY_VARIABLE = "SME_LEADERBOARD_KEY"
+DEFAULT_KEY = Path(typer.get_app_dir("sme-leaderboard")) / "ed25519.key"
+KeyFile = Annotated[
+    Path,
+    typer.Option(
+        "--key",
+        envvar=KEY_VARIABLE,
+        help="Your signing key, created when you first need it.",
+        show_default="sme-leaderboard/ed25519.key in your settings folder",
+    ),
+]
+
+ADVANCED = "Advanced"
+"""The panel of the options that few need, where a command has more than ten."""
+
+method_name = typer.Option(
+    "--method", help="Name of the method: letters a–z, digits, single spaces and ._+-()."
+)
+submitter_name = typer.Option(
+    "--submitter",
+    help="Your name or your lab's; on a board it belongs to the first key that uses it.",
+)
+MethodName = Annotated[str, method_name]
+SubmitterName = Annotated[str, submitter_name]
+MethodVersion = Annotated[
+    str, typer.Option(help="Version of the method.", rich_help_panel=ADVANCED)
+]
+Family = Annotated[
+    str | None,
+    typer.Option(
+        help="Family such as PPO; the method's name by default.", rich_help_panel=ADVANCED
+    ),
+]
+CodeLink = Annotated[str | None, typer.Option("--code", help="An https link to the code.")]
+Statement = Annotated[
+    str, typer.Option(help="A note for readers of the board.", rich_help_panel=ADVANCED)
+]
+
+
+def own_key(path: Path) -> SigningKey:
+    """The user's signing key, created when it is first needed."""
+    if not path.exists():
+        SigningKey.generate().write(path)
+        print_note(
+            f"Created your signing key, {escape(str(path))}. It proves who you are: keep it "
+            "secret, and keep a copy."
+        )
+    return SigningKey.read(path)
+
+
+def board_document(board: str) -> BoardDocument:
+    """The definition of a board, by its folder or URL."""
+    return client.board_document(board) if is_url(board) else Folder(board).read()
+
+
+def receiver_of(board: str) -> Receiver:
+    """For whom to sign what is given to a board, by its folder or URL; errors as above."""
+    return client.receiver_of(board) if is_url(board) else Receiver(Folder(board).read().key)
+
+
+SuiteName = Annotated[
+    str,
+    typer.Option(
+        help="A suite's name (see `sme list`) or file, or the board that has it.",
+        autocompletion=catalogue.completion(SuiteFile),
+    ),
+]
+
+
+def find_suite(name: str) -> SuiteFile:
+    """A suite by its name in the catalogue, its file's path, or a board that has it."""
+    if is_url(name) or os.path.isfile(os.path.join(name, BOARD)):
+        return board_document(name).suite_file
+    is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
+    file = SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
+    refuse_unscored(file.suite)
+    return file
+
 
 app = typer.Typer()
 

@@ -67,7 +67,7 @@ class Limits(StrictModel):
 
 
 def refuse_unscored(suite: Suite) -> None:
-    """Raise SpecError if a suite has what boards do not score: streams, safety or observation.
+    """Raise SpecError if a suite has what boards do not score: streams, or more than plain tasks.
 
     A rank by distance from the optimum alone would favour agents that break limits.
     """
@@ -75,8 +75,9 @@ def refuse_unscored(suite: Suite) -> None:
     extended = ", ".join(member.name for member in suite.classes if not member.setting.is_plain)
     if extended:
         raise SpecError(
-            f"suite: has classes with safety or observation ({extended}), and a leaderboard scores "
-            "neither. Choose a suite without them; studies train on them: `sme study new --suite`."
+            f"suite: has classes with safety, observation, shaping or noise ({extended}), and a "
+            "leaderboard scores none of these. Choose a suite without them; studies train on them: "
+            "`sme study new --suite`."
         )
 
 

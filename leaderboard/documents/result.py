@@ -10,7 +10,7 @@ Per run, ρ_m the mean |a − a*| of region m and ρ⁰_m the same of the consta
     similarity loss          100 (r̃_WD − mean r̃_OOD) points
 
 A run that failed, or was started and not listed, scores 1 in every region and every metric, and
-loses 100 points of similarity: a missing policy never improves a score. `scoring.aggregation` says
+loses 100 points of similarity: a missing policy never improves a score. `scoring.ranking` says
 how runs become scores. Fields younger than version 1 are left out of the JSON at their defaults.
 """
 
@@ -19,6 +19,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
@@ -250,3 +251,70 @@ class Result(Document):
         if (self.status == "rejected") != (self.code in CODES):
             raise ValueError("code: required if status is 'rejected', not allowed otherwise.")
         return self
+
+
+Status = Literal["waiting", "scored", "rejected", "withdrawn"]
+
+
+@dataclass(frozen=True)
+class Copies:
+    """An earlier submission whose policies some runs of a submission act like."""
+
+    id: str
+    key: str
+    runs: int  # of which each counts for the earliest submission that it is like
+
+
+@dataclass(frozen=True)
+class EntryRow:
+    """One submission, as pages and ranking need it."""
+
+    id: str
+    sequence: int  # of the log entry that received it, and so the order of submission
+    received: str
+    status: Status  # a "withdrawn" one may have scores
+    code: str  # of its rejection; empty if it was not rejected
+    method: str
+    version: str
+    family: str
+    knowledge: str
+    submitter: str
+    key: str
+    code_link: str | None
+    runs: int  # listed in the submission, failed ones included
+    steps: int  # of all runs
+    enough_runs: bool
+    oracle_like: bool
+    reference: bool  # whether it is one of the board's own rows, "optimal" and "constant"
+    scores: Scores | None
+    policies: int = 0  # runs with a policy
+    alike: tuple[Copies, ...] = ()  # the board's own rows excluded; empty before scoring
+    faults: int = 0  # that have ended its scoring while it waits; 0 in a read-only store
+    fault: str = ""  # the last of them
+
+    @property
+    def copy_of(self) -> tuple[Copies, ...]:
+        """Earlier submissions of other keys, the one with the most runs first."""
+        others = (each for each in self.alike if each.key != self.key)
+        return tuple(sorted(others, key=lambda each: -each.runs))
+
+    @property
+    def copied_runs(self) -> int:
+        """Number of runs that behave like runs of earlier submissions of other keys."""
+        return sum(each.runs for each in self.copy_of)
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether at least half of its policies are copied, and so it has no rank."""
+        return self.copied_runs > 0 and 2 * self.copied_runs >= self.policies
+
+    @property
+    def origin(self) -> str:
+        """The id of the submission that first had at least half of its policies; mostly its own."""
+        first = max(self.alike, key=lambda each: each.runs, default=None)
+        return self.id if first is None or 2 * first.runs < self.policies else first.id
+
+    @property
+    def steps_per_run(self) -> int:
+        """Mean environment steps of the listed runs, rounded."""
+        return round(self.steps / max(1, self.runs))

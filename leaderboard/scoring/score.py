@@ -67,12 +67,7 @@ from leaderboard.documents.submission import Submission
 from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation, available_isolation
 from leaderboard.gate.sandbox import Actions, Observations, Sandbox, SandboxLimits, widths
-from leaderboard.scoring.aggregation import (
-    failed_run,
-    never_listed,
-    result_of,
-    scored_run,
-)
+from leaderboard.scoring.ranking import failed_run, never_listed, result_of, scored_run
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.errors import PolicyError, SMEError
 from sme_registry.evaluation import EvaluationReport, as_policy

@@ -30,13 +30,7 @@ from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.result import Result, RunScore
 from leaderboard.documents.submission import Run
 from leaderboard.errors import Rejection, TamperedError
-from leaderboard.scoring.aggregation import (
-    failed_run,
-    levels_of,
-    never_listed,
-    result_of,
-    run_metrics,
-)
+from leaderboard.scoring.ranking import failed_run, levels_of, never_listed, result_of, run_metrics
 from leaderboard.scoring.score import agent_names, evaluation_seed, score_submission
 from leaderboard.store import LogEntry, Store, digest_of, read_document
 from sme_registry import SMESpec

@@ -1,8 +1,7 @@
 """Seasons: tasks that nobody sees before they count, offline and online, of one board.
 
 `COMMANDS` are their commands, by name: module and summary. A board gets the rest where it is
-opened (`events`: kinds of log entries and their tables), served (`web`: routes), shown (`pages`)
-and checked (`verify`).
+opened (`store`), served and shown (`web`: routes and pages), fetched and checked (`publication`).
 """
 
 _ENTRANT, _ORGANISER = f"{__name__}.entrant", f"{__name__}.cli"

@@ -6,25 +6,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.markup import escape
 
-from leaderboard.cli import options
-from leaderboard.cli.options import BoardFolder, Json
-from leaderboard.cli.results import ranking_table
+from leaderboard.cli.results import BoardFolder, Json, open_board, ranking_table
 from leaderboard.documents.result import Metric
 from leaderboard.errors import Rejection
 from leaderboard.scoring.ranking import RankedRow
-from leaderboard.seasons.events import SeasonRow
 from leaderboard.seasons.publication import (
-    EASY,
     check_published,
     copy_published,
     create_season,
     read_plan,
     read_season,
     refuse_unfit,
-    table_regret,
 )
 from leaderboard.seasons.scoring import (
     by_key,
@@ -34,11 +30,13 @@ from leaderboard.seasons.scoring import (
     season_rankings,
 )
 from leaderboard.seasons.season import Master, Reveal, Terms
-from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.store import SeasonRow, SeasonStore
+from sme_registry import SMESpec, materialize
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new, read_json
 from sme_registry.io.markup import Table, plural
 from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
+from sme_registry.spec import Setting
 
 _UNITS = {"sealed-offline": ("entry", "entries"), "sealed-online": ("ticket", "tickets")}
 
@@ -276,7 +274,7 @@ def show(
 
 
 def _open(board: Path) -> SeasonStore:
-    store = options.open_board(board)
+    store = open_board(board)
     assert isinstance(store, SeasonStore)
     return store
 
@@ -327,3 +325,39 @@ def _secret(board: Path, season: str, given: Path | None) -> Path:
 
 app = typer.Typer()
 app.add_typer(season, name="season")
+
+
+# With few state channels a table of states, of which the nearest answer, fills the cube.
+EASY = 0.1
+"""Below it a table leaves little to learn."""
+
+MOST_ROWS = 10_000
+_NEIGHBOURS = (1, 8)
+_SEEDS = (0, 1)  # public: nothing is measured on hidden tasks
+_QUESTIONS = 300
+
+
+def table_regret(setting: Setting, rows: int) -> float:
+    """The normalised regret N₀ within the cube of a table of random states and their optima.
+
+    `rows` is the size of the data set, or the steps of the budget; at most `MOST_ROWS` are taken.
+    It is the mean over public tasks of this setting, of the better of the nearest state's optimum
+    and the mean of the eight nearest ones. Labels are exact, so data with noise do worse.
+    """
+    return float(np.mean([_regret(setting, rows, seed) for seed in _SEEDS]))
+
+
+def _regret(setting: Setting, rows: int, seed: int) -> float:
+    from scipy.spatial import cKDTree
+
+    task = materialize(SMESpec.from_dict({**setting.to_dict(), "seed": seed}))
+    random = np.random.default_rng(seed)
+    states = random.random((min(rows, MOST_ROWS), setting.state_dim))
+    asked = random.random((_QUESTIONS, setting.state_dim))
+    labels, optimum = task.optimal_action(states), task.optimal_action(asked)
+    tree = cKDTree(states)
+    errors = []
+    for count in _NEIGHBOURS:
+        _, nearest = tree.query(asked, range(1, min(count, len(states)) + 1))
+        errors.append(np.abs(labels[nearest].mean(axis=1) - optimum).mean())
+    return float(min(errors) / np.abs(0.5 - optimum).mean())

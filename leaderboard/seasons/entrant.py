@@ -13,9 +13,9 @@ import typer
 from rich.markup import escape
 
 from leaderboard.admission import upload_header
-from leaderboard.cli.options import (
+from leaderboard.cli.results import BoardOrUrl, is_url
+from leaderboard.cli.submit import (
     DEFAULT_KEY,
-    BoardOrUrl,
     CodeLink,
     Family,
     KeyFile,
@@ -23,7 +23,6 @@ from leaderboard.cli.options import (
     MethodVersion,
     Statement,
     SubmitterName,
-    is_url,
     own_key,
     receiver_of,
 )
@@ -31,9 +30,9 @@ from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.publication import name_of, read_season
+from leaderboard.seasons.scoring import enter as enter_folder
 from leaderboard.seasons.season import Entry, Season, TicketRequest
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.store import enter as enter_folder
 from leaderboard.web.client import Progress as Sent
 from leaderboard.web.client import ServedBoard
 from sme_registry.errors import OptionError, SpecError

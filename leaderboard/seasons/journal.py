@@ -38,12 +38,18 @@ import numpy as np
 import numpy.typing as npt
 
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.seasons.season import Stepping
+from leaderboard.seasons.season import (
+    MAX_LANES,
+    SealedResult,
+    Season,
+    Stepping,
+    rows_of,
+)
 from sme_registry import io
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.io import open_regular
-from sme_registry.seasons.transcript import Chain, next_head
-from sme_registry.seasons.wire import StepFormat, StepsAnswer
+from sme_registry.seasons.transcript import EVERY, Chain, next_head
+from sme_registry.seasons.wire import StepFormat, StepsAnswer, table_bytes
 from sme_registry.spec import SMESpec
 
 _MAGIC = b"sme-journal/1\n\0\0"
@@ -303,3 +309,29 @@ def _ratio(sums: npt.NDArray[np.float64], possible: int) -> float:
     share = taken / float(possible)
     # The constant has no regret only where π* is ½ throughout, and so has none either.
     return share * (regret / half if half > 0.0 else 0.0) + 1.0 - share
+
+
+_RECORD_BYTES, _HEAD_BYTES = 12, 4096  # of a journal; heads with the signature's file
+_SNAPSHOT_BYTES, _NUMBERS_OF_A_LANE = 2**14, 40  # of a snapshot; bytes of a lane, for each channel
+
+
+def played_bytes(season: Season, result: SealedResult | None = None) -> int:
+    """The most bytes that the journals, challenges, answers and snapshots of a ticket take.
+
+    A journal is longest where a single lane is stepped: then each step has a record of its own.
+    After the ticket's result nothing more is written.
+    """
+    total = 0
+    rows = rows_of(season.protocol)
+    for number, (member, _) in enumerate(season.hidden):
+        S, A = member.setting.state_dim, member.setting.action_dim
+        steps, answered = member.budget or 0, True
+        if result is not None:  # what was not signed may be in the journal, too
+            steps = min(steps, result.stepping[number].steps + EVERY * MAX_LANES)
+            answered = result.runs[number].artefact is not None
+        total += steps * (_RECORD_BYTES + 4 * A) + table_bytes(rows, S + 2) + _HEAD_BYTES
+        total += 4 * MAX_LANES * A  # the record that ends a journal
+        total += table_bytes(rows, A) * answered
+        if result is None:
+            total += _SNAPSHOT_BYTES + MAX_LANES * _NUMBERS_OF_A_LANE * (S + A + 4)
+    return total

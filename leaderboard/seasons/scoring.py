@@ -1,4 +1,7 @@
-"""From the answers in challenge states to the result of an entry or ticket, and to the rankings.
+"""What a season accepts as an entry; from answers to results of entries and tickets, and to ranks.
+
+The answers of an entry are uploads of the entrant's key, which come first, and are checked when the
+entry is. Nothing is scored before the reveal.
 
     challenge states  the observations that `sme_registry.evaluate` shows to a policy under the
                       season's protocol, with the seed of the instance's secret
@@ -15,26 +18,31 @@ the board's `runs_to_rank` runs in each class, over all tickets.
 
 from __future__ import annotations
 
+import datetime
 import functools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from leaderboard.documents.board import RULES
+from leaderboard.admission import ReadFile, check_entrant, check_manifest, check_stored
+from leaderboard.documents.board import RULES, check_receiver
 from leaderboard.documents.result import Metric, RunScore, Scores
+from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import Artefact, Knowledge
-from leaderboard.scoring.aggregation import (
+from leaderboard.errors import Rejection
+from leaderboard.scoring.ranking import (
     Groups,
+    RankedRow,
     class_score,
     failed_run,
     is_oracle_like,
     method_scores,
+    ranking,
     scored_run,
 )
-from leaderboard.scoring.ranking import RankedRow, ranking
-from leaderboard.seasons.events import SealedRow
 from leaderboard.seasons.season import (
+    Entry,
     Float32,
     Hidden,
     Master,
@@ -45,7 +53,10 @@ from leaderboard.seasons.season import (
     Terms,
     read_answers,
 )
-from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.store import (
+    SealedRow,
+    SeasonStore,
+)
 from leaderboard.store import EntryRow
 from leaderboard.web.tables import row_facts
 from sme_registry import EvaluationProtocol, SMESpec
@@ -346,3 +357,79 @@ def _score_together(
     scores = method_scores(_groups(season, runs), store.document.draws, season.digest)
     every = [run for each in runs for run in each]
     return scores, is_oracle_like(scores, store.document.rules, every)
+
+
+def enter(
+    store: SeasonStore,
+    signed: Signed[Entry],
+    answers: ReadFile | None = None,
+    address: str | None = None,
+) -> bool:
+    """Check an entry, its signature verified, and store it; False if the board has it.
+
+    Args:
+      store, signed: the board and the entry.
+      answers: returns the bytes of an answer by digest; they are stored with the entry. By default
+        the entrant's key has uploaded them.
+      address: of the server that it was sent to; None if it was given to the board's folder.
+    """
+    check_receiver(store.document, signed.receiver, address)
+    if store.entrant(signed.id) is not None:
+        return False
+    entry, key = signed.content, signed.content.submitter.key
+    check_manifest(store.document, entry, datetime.datetime.fromisoformat(store.time))
+    store.open_season(entry.season, "sealed-offline", key)
+    season = store.season(entry.season)
+    given = _check_answers(store, season, signed, answers)
+    with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
+        check_entrant(store, entry.submitter, len(signed.to_bytes()))
+        _check_newest(store, season, entry)
+        for answer in given:
+            if answers is not None:
+                store.put_object(answer.sha256, answers(answer.sha256), by=key)
+            check_stored(store, key, answer)
+        return store.add("entry", signed)[1]
+
+
+def _check_newest(store: SeasonStore, season: Season, entry: Entry) -> None:
+    """Refuse an entry that would not count, as its key has signed a later one of its method."""
+    own = entry.submitter.key, entry.method.name.casefold()
+    for row in store.entrants(season.digest):
+        if row.method == own and row.created > entry.created:
+            raise Rejection(
+                "stale_time",
+                f"created={entry.created}: entry {row.number} of the same key and method was "
+                f"signed later, at {row.created}. The one signed last counts: check your clock, "
+                "and sign this one again.",
+            )
+
+
+def _check_answers(
+    store: SeasonStore, season: Season, signed: Signed[Entry], read: ReadFile | None
+) -> list[Artefact]:
+    """The answers that are not null, each in the shape of its instance's challenge."""
+    entry, hidden = signed.content, list(season.hidden)
+    if len(entry.answers) != len(hidden):
+        raise Rejection(
+            "answer_missing",
+            f"answers: has {len(entry.answers)}: must have {len(hidden)}, one for each instance of "
+            f"the season {season.id}, null where the method failed.",
+        )
+    given, checked = [], set()
+    for number, (answer, each) in enumerate(zip(entry.answers, hidden, strict=True)):
+        if answer is None:
+            continue
+        if read is None:
+            check_stored(store, entry.submitter.key, answer)
+        # Many instances may have the same answers, which are read once for each shape.
+        form = answer.sha256, each.member.setting.action_dim
+        try:
+            if form not in checked:
+                data = (read or store.objects.read)(answer.sha256)
+                read_answers(data, each.member.setting, season.protocol)
+                checked.add(form)
+        except Rejection as error:
+            where = f"answers.{number} (class {each.member.name}, instance {each.instance})"
+            raise Rejection(error.code, f"{where}: {error.message}") from None
+        given.append(answer)
+    return given

@@ -115,7 +115,7 @@ class SeasonClass(Document):
                 "without any learning. Use a deeper setting."
             )
         if setting.team is not None or not setting.is_plain:
-            fields = ("team", "safety", "observation")
+            fields = ("team", "safety", "observation", "shaping", "noise")
             field = next(name for name in fields if getattr(setting, name) is not None)
             raise ValueError(
                 f"{field}: must be null in a sealed season, whose scores are the normalised regret "

@@ -1,44 +1,357 @@
-"""`SeasonStore`: a board with seasons; and what it admits of entries and requests for tickets.
+"""`SeasonStore`: a board with seasons, whose tracks are seasons with entries and tickets.
 
-What may change when follows from the time at which the log receives it. Before, what is sent is
-checked: the answers of an entry come first, as uploads of the entrant's key, and nothing is scored
-before the reveal. The answer to a request for a ticket has the ticket's password, and a board keeps
-requests where others may read them. So a request is sent with a header `Authorization` as for an
-upload, whose signature is at most ten minutes old, and nobody else can repeat it.
+`Seasons` are the tables, and what log entries do to them: a function of the log and of public
+documents, which holds nothing of a hidden instance. What may change when follows from the time at
+which the log receives it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import datetime
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeVar
 
-from leaderboard.admission import ReadFile, check_entrant, check_manifest, check_stored, uploader
-from leaderboard.documents.board import check_receiver, hex_of
+from leaderboard.documents.board import hex_of
+from leaderboard.documents.result import EntryRow, Scores
 from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import Artefact
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.seasons.events import (
-    SEASON_KINDS,
-    SealedRow,
-    SeasonRow,
-    Seasons,
-    played_bytes,
-    unknown_season,
-)
+from leaderboard.seasons.journal import played_bytes
 from leaderboard.seasons.season import (
     Admitted,
     Entry,
     Master,
     Reveal,
+    SealedManifest,
     SealedResult,
     SealedTrack,
     Season,
     TicketRequest,
-    read_answers,
 )
 from leaderboard.store import Store
+from leaderboard.store.index import KINDS, Index, Kinds
+from leaderboard.store.log import LogEntry
+
+_Signed = TypeVar("_Signed", bound=Signed[SealedManifest])
+
+
+class SeasonRow(NamedTuple):
+    """One season, as pages need it."""
+
+    digest: str  # of season.json's content
+    sequence: int
+    announced: str  # time of the log entry
+    document: str  # SHA-256 of season.json
+    id: str
+    title: str
+    track: SealedTrack
+    opens: str
+    closes: str
+    instances: int  # number of hidden ones, of each ticket or of all entries
+    reveal: str | None  # SHA-256 of reveal.json; None until the reveal
+    revealed: str  # when; empty likewise
+
+    def state(self, time: str) -> str:
+        if self.reveal is not None:
+            return "revealed"
+        return "announced" if time < self.opens else "open" if time < self.closes else "closed"
+
+
+@dataclass(frozen=True)
+class SealedRow:
+    season: str  # digest
+    number: int  # 1 for the first of its season, in the log's order
+    created: str  # when it was signed, as the entrant says
+    document: str  # SHA-256 of its file
+    result: str | None  # SHA-256 of its result's file; None without one
+    finished: str  # when it got its result; empty likewise
+    # Received when the ticket started; `runs` are hidden instances, `policies` are answers.
+    entrant: EntryRow
+
+    @property
+    def method(self) -> tuple[str, str]:
+        """What it is of: a key, and the method's name in lower case."""
+        return self.entrant.key, self.entrant.method.casefold()
+
+
+class Seasons:
+    """The seasons of a board's index."""
+
+    def __init__(self, index: Index) -> None:
+        self._index = index
+
+    def rows(self) -> list[SeasonRow]:
+        return [SeasonRow(*row) for row in self._all(f"{_SEASONS} ORDER BY sequence")]
+
+    def row(self, name: str) -> SeasonRow | None:
+        rows = self._all(f"{_SEASONS} WHERE digest = ?1 OR id = ?1", name)
+        return SeasonRow(*rows[0]) if rows else None
+
+    def named(self, name: str) -> SeasonRow:
+        row = self.row(name)
+        if row is None:
+            raise Rejection(
+                "season_unknown",
+                f"season={name[:80]}: is not on this board. `sme-leaderboard season show` lists "
+                "its seasons.",
+            )
+        return row
+
+    def entrants(self, season: str) -> list[SealedRow]:
+        return self._sealed("track = ? ORDER BY number", season)
+
+    def entrant(self, id: str) -> SealedRow | None:
+        return next(iter(self._sealed("id = ? AND track <> ''", id)), None)
+
+    def ticket(self, season: str, number: int) -> SealedRow | None:
+        return next(iter(self._sealed("track = ? AND number = ?", season, number)), None)
+
+    def next_number(self, season: str) -> int:
+        return self._index.number("SELECT count(*) + 1 FROM entry WHERE track = ?", season)
+
+    def read(self, row: SeasonRow) -> Season:
+        return self._index.objects.document(Season, row.document)
+
+    def _season(self, entry: LogEntry) -> None:
+        season = self._index.read(Season, entry)
+        entry.check_subject(season.digest)
+        if self.row(season.digest) is not None or self.row(season.id) is not None:
+            raise entry.contradiction("announces a season twice")
+        values = {
+            "digest": entry.subject,
+            "sequence": entry.sequence,
+            "announced": entry.time,
+            "document": entry.document,
+            "kind": season.track,
+            "instances": sum(1 for _ in season.hidden),
+        }
+        values |= {name: getattr(season, name) for name in ("id", "title", "opens", "closes")}
+        self._index.insert("track", values)
+
+    def _admitted(self, entry: LogEntry) -> None:
+        admitted = self._index.read(Admitted, entry)
+        row = self.row(admitted.season)
+        if row is None or entry.subject != row.digest:
+            raise entry.contradiction("the season is unknown")
+        if row.reveal is not None:
+            raise _revealed(row)
+        if admitted.key in self.admitted(row.digest):
+            raise entry.contradiction("admits a key twice")
+        self._index.insert(
+            "admitted", {"track": row.digest, "key": admitted.key, "name": admitted.name}
+        )
+
+    def admitted(self, season: str) -> dict[str, str]:
+        """The names of the admitted keys of a season, by its digest."""
+        return dict(self._all("SELECT key, name FROM admitted WHERE track = ?", season))
+
+    def _entry(self, entry: LogEntry) -> None:
+        season, signed = self._signed(entry, "sealed-offline", Signed[Entry])
+        answers = signed.content.answers
+        if len(answers) != season.instances:
+            raise entry.contradiction("names more or fewer answers than there are instances")
+        given = [answer for answer in answers if answer is not None]
+        self._add(entry, season, signed.content, len(given), 0)
+        for answer in given:
+            self._index.name_artefact(answer, signed.content.submitter.key, entry)
+
+    def _ticket(self, entry: LogEntry) -> None:
+        row, signed = self._signed(entry, "sealed-online", Signed[TicketRequest])
+        season = self.read(row)
+        self._check_limits(season, signed.content.submitter.key)
+        self._add(entry, row, signed.content, row.instances, played_bytes(season))
+
+    def _signed(
+        self, entry: LogEntry, track: SealedTrack, kind: type[_Signed]
+    ) -> tuple[SeasonRow, _Signed]:
+        signed = self._index.read(kind, entry)
+        entry.check_subject(signed.id)
+        key = signed.content.submitter.key
+        return self.open(signed.content.season, track, key, entry.time), signed
+
+    def open(self, name: str, track: SealedTrack, key: str, time: str) -> SeasonRow:
+        """The season of this id or digest; a `Rejection` unless it is open to a key at a time."""
+        row = self.named(name)
+        if row.track != track:
+            raise Rejection(
+                "season_track",
+                f"season={row.id}: its track is {row.track}: must be {track}. Offline seasons take "
+                "entries, online ones start tickets.",
+            )
+        if row.reveal is not None:
+            raise _revealed(row)
+        if time < row.opens:
+            raise Rejection(
+                "season_not_open",
+                f"season={row.id}: opens at {row.opens}, and it is {time}. Come back then.",
+            )
+        if time >= row.closes:
+            raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
+        if self.read(row).admission == "listed" and key not in self.admitted(row.digest):
+            raise Rejection(
+                "not_admitted",
+                f"key={key[:16]}…: the organiser of the season {row.id} has not admitted it. Send "
+                "the public key to the organiser, who adds it with `sme-leaderboard season admit`.",
+            )
+        return row
+
+    def _check_limits(self, season: Season, key: str) -> None:
+        assert season.tickets is not None  # the track is online
+        assert season.tickets_per_key is not None
+        own = self._index.number(
+            "SELECT count(*) FROM entry WHERE track = ? AND key = ?", season.digest, key
+        )
+        if own >= season.tickets_per_key:
+            raise Rejection(
+                "ticket_limit",
+                f"key={key[:16]}…: has started {own} of {season.tickets_per_key} tickets of "
+                f"the season {season.id}. Every one of them counts.",
+            )
+        if self.next_number(season.digest) > season.tickets:
+            raise Rejection(
+                "ticket_limit",
+                f"season={season.id}: all of its {season.tickets} tickets were started. Ask the "
+                "board's owner for another season.",
+            )
+
+    def _add(
+        self, entry: LogEntry, row: SeasonRow, manifest: SealedManifest, policies: int, played: int
+    ) -> None:
+        key, name = manifest.submitter.key, manifest.submitter.name
+        self._index.add_entrant(
+            entry,
+            manifest,
+            status="entered",
+            track=row.digest,
+            number=self.next_number(row.digest),
+            created=manifest.created,
+            submitter=self.admitted(row.digest).get(key, name),
+            runs=row.instances,
+            policies=policies,
+            reserved=played,
+        )
+
+    def _result(self, entry: LogEntry) -> None:
+        row = self.entrant(entry.subject)
+        season = None if row is None else self.row(row.season)
+        if row is None or season is None or row.result is not None:
+            raise entry.contradiction("the entry or ticket is unknown, or has a result")
+        online = season.track == "sealed-online"
+        if online != (entry.event == "ended") or not (online or season.reveal):
+            raise entry.contradiction("of another track, or before the reveal")
+        result = self._index.read(SealedResult, entry)
+        entry.check_subject(result.subject)
+        sizes = len(result.runs), len(result.stepping)
+        if result.season != row.season or sizes != (season.instances, season.instances * online):
+            raise entry.contradiction("names a result of another season")
+        self._index.connection.execute(
+            "UPDATE entry SET status = 'scored', result = ?, finished = ?, policies = ?, "
+            "steps = ?, oracle_like = ?, scores = ?, reserved = ? WHERE id = ?",
+            (
+                *(entry.document, entry.time),
+                sum(run.artefact is not None for run in result.runs),
+                sum(each.steps for each in result.stepping),
+                *(result.oracle_like, result.scores.to_text()),
+                played_bytes(self.read(season), result) if online else 0,
+                entry.subject,
+            ),
+        )
+
+    def _revealed(self, entry: LogEntry) -> None:
+        row = self.row(entry.subject)
+        if row is None or row.digest != entry.subject:
+            raise entry.contradiction("the season is unknown")
+        reveal = self._index.read(Reveal, entry)
+        entry.check_subject(reveal.season)
+        master = Master(bytes.fromhex(reveal.master))
+        if not self.read(row).is_committed_to(master):
+            raise Rejection(
+                "reveal_mismatch",
+                f"master: does not match the commitment of the season {row.id}. Give the file "
+                "that `sme-leaderboard season new` wrote.",
+            )
+        if row.reveal is not None:
+            raise entry.contradiction("the season is already revealed")
+        for other in self.rows():  # whose tasks may follow from the same secret
+            if other.reveal is None and self.read(other).is_committed_to(master):
+                self._check_over(other, entry.time)
+        self._index.connection.execute(
+            "UPDATE track SET reveal = ?, revealed = ? WHERE digest = ?",
+            (entry.document, entry.time, entry.subject),
+        )
+
+    def _check_over(self, row: SeasonRow, time: str) -> None:
+        """Reject (`season_not_closed`) a reveal while entrants can still play."""
+        if time < row.closes:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
+                "until then.",
+            )
+        running = [each.number for each in self.entrants(row.digest) if each.result is None]
+        if row.track == "sealed-online" and running:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: {len(running)} tickets run, the first of them number "
+                f"{running[0]}. Serve the board until their deadlines have passed.",
+            )
+
+    def _sealed(self, where: str, *values: Any) -> list[SealedRow]:
+        return [_sealed(row) for row in self._all(f"{_SEALED} WHERE {where}", *values)]
+
+    def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
+        return self._index.connection.execute(statement, values).fetchall()
+
+
+_OF_SEASONS = {
+    "season": Seasons._season,
+    "admitted": Seasons._admitted,
+    "entry": Seasons._entry,
+    "ticket": Seasons._ticket,
+    "ended": Seasons._result,
+    "ranked": Seasons._result,
+    "revealed": Seasons._revealed,
+}
+
+
+def _revealed(row: SeasonRow) -> Rejection:
+    return Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
+
+
+def _apply(index: Index, entry: LogEntry) -> None:
+    _OF_SEASONS[entry.event](Seasons(index), entry)
+
+
+SEASON_KINDS: Kinds = {**KINDS, **dict.fromkeys(_OF_SEASONS, _apply)}
+
+_SEASONS = (
+    "SELECT digest, sequence, announced, document, id, title, kind, opens, closes, instances, "
+    "reveal, revealed FROM track"
+)
+_OF_ENTRANT = (
+    *("id", "sequence", "received", "method", "version", "family", "knowledge", "submitter", "key"),
+    *("code_link", "runs", "steps", "policies", "oracle_like", "scores"),
+)
+_SEALED = (
+    f"SELECT track, number, created, document, result, finished, {', '.join(_OF_ENTRANT)} "
+    "FROM entry"
+)
+
+
+def _sealed(row: tuple[Any, ...]) -> SealedRow:
+    season, number, created, document, result, finished, *rest = row
+    values = dict(zip(_OF_ENTRANT, rest, strict=True))
+    scores = values.pop("scores")
+    entrant = EntryRow(
+        **{**values, "oracle_like": bool(values["oracle_like"])},
+        status="waiting" if scores is None else "scored",
+        code="",
+        enough_runs=False,
+        reference=False,
+        scores=None if scores is None else Scores.from_text(scores),
+    )
+    return SealedRow(season, number, created, document, result, finished, entrant)
 
 
 class SeasonStore(Store):
@@ -57,10 +370,7 @@ class SeasonStore(Store):
 
     def season_row(self, name: str) -> SeasonRow:
         with self._reading() as seasons:
-            row = seasons.row(name)
-        if row is None:
-            raise unknown_season(name)
-        return row
+            return seasons.named(name)
 
     def season(self, name: str) -> Season:
         return self.objects.document(Season, self.season_row(name).document)
@@ -69,15 +379,11 @@ class SeasonStore(Store):
         """`published` has data sets and challenge states, `tickets` what was played."""
         return self.folder.seasons / hex_of(digest)
 
-    def ticket_folder(self, season: str, number: int) -> Path:
-        return self.season_folder(season) / "tickets" / str(number)
-
     def admitted(self, season: str) -> dict[str, str]:
         with self._reading() as seasons:
             return seasons.admitted(season)
 
     def entrants(self, season: str) -> list[SealedRow]:
-        """The entries or tickets of a season, in the log's order."""
         with self._reading() as seasons:
             return seasons.entrants(season)
 
@@ -95,6 +401,9 @@ class SeasonStore(Store):
                 "`sme-leaderboard ticket`.",
             )
         return row
+
+    def ticket_folder(self, season: str, number: int) -> Path:
+        return self.season_folder(season) / "tickets" / str(number)
 
     def entry_of(self, row: SealedRow) -> Signed[Entry]:
         return self.objects.document(Signed[Entry], row.document)
@@ -117,17 +426,16 @@ class SeasonStore(Store):
         return Master(bytes.fromhex(self.objects.document(Reveal, row.reveal).master))
 
     def open_season(self, name: str, track: SealedTrack, key: str) -> SeasonRow:
-        """`Seasons.open`, now."""
         with self._reading() as seasons:
             return seasons.open(name, track, key, self.clock.time)
 
     def announce(self, season: Season) -> bool:
-        """Publish a season and its commitment; False if the board already has it."""
+        """False if the board already has it."""
         with self.transaction() as index:
             row = Seasons(index).row(season.id)
-            if row is not None and row.digest == season.digest:
-                return False
             if row is not None:
+                if row.digest == season.digest:
+                    return False
                 raise BoardError(
                     f"id={season.id}: another season of this board has it. Choose another id."
                 )
@@ -140,29 +448,19 @@ class SeasonStore(Store):
         return True
 
     def admit(self, season: str, key: str, name: str) -> bool:
-        """Add a key to the list of a season, under the name that pages show; False if it is on it.
-
-        `season` is its id.
-        """
+        """Add a key to a season's list, under the name that pages show; False if it is on it."""
         with self.transaction() as index:
             row = self.season_row(season)
-            if row.reveal is not None:
-                raise Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
             admitted = Admitted.from_dict({"season": row.digest, "key": key, "name": name})
             if key in Seasons(index).admitted(row.digest):
                 return False
             self.record("admitted", row.digest, admitted)
         return True
 
-    def enter(self, signed: Signed[Entry]) -> bool:
-        """Add an entry, which was admitted, to an open season; False if the board has it."""
-        return self._add("entry", signed)[1]
-
-    def start_ticket(self, signed: Signed[TicketRequest]) -> tuple[int, bool]:
-        """Start a ticket in an open season: its number, and whether it is new."""
-        return self._add("ticket", signed)
-
-    def _add(self, event: str, signed: Signed[Entry] | Signed[TicketRequest]) -> tuple[int, bool]:
+    def add(
+        self, event: Literal["entry", "ticket"], signed: Signed[Entry] | Signed[TicketRequest]
+    ) -> tuple[int, bool]:
+        """Add what was admitted to an open season: its number, and whether it is new."""
         with self.transaction() as index:
             known = Seasons(index).entrant(signed.id)
             if known is not None:
@@ -199,125 +497,3 @@ class SeasonStore(Store):
                 return False
             self.record("revealed", row.digest, reveal)
         return True
-
-
-def enter(
-    store: SeasonStore,
-    signed: Signed[Entry],
-    answers: ReadFile | None = None,
-    address: str | None = None,
-) -> bool:
-    """Check an entry, its signature verified, and store it; False if the board has it.
-
-    Args:
-      store, signed: the board and the entry.
-      answers: returns the bytes of an answer by digest; they are stored with the entry. By default
-        the entrant's key has uploaded them.
-      address: of the server that it was sent to; None if it was given to the board's folder.
-    """
-    check_receiver(store.document, signed.receiver, address)
-    if store.entrant(signed.id) is not None:
-        return False
-    entry, key = signed.content, signed.content.submitter.key
-    check_manifest(store.document, entry, datetime.datetime.fromisoformat(store.time))
-    store.open_season(entry.season, "sealed-offline", key)
-    season = store.season(entry.season)
-    given = _check_answers(store, season, signed, answers)
-    with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
-        check_entrant(store, entry.submitter, len(signed.to_bytes()))
-        _check_newest(store, season, entry)
-        for answer in given:
-            if answers is not None:
-                store.put_object(answer.sha256, [answers(answer.sha256)], by=key)
-            check_stored(store, key, answer)
-        return store.enter(signed)
-
-
-def _check_newest(store: SeasonStore, season: Season, entry: Entry) -> None:
-    """Refuse an entry that would not count, as its key has signed a later one of its method."""
-    own = entry.submitter.key, entry.method.name.casefold()
-    for row in store.entrants(season.digest):
-        if row.method == own and row.created > entry.created:
-            raise Rejection(
-                "stale_time",
-                f"created={entry.created}: entry {row.number} of the same key and method was "
-                f"signed later, at {row.created}. The one signed last counts: check your clock, "
-                "and sign this one again.",
-            )
-
-
-def _check_answers(
-    store: SeasonStore, season: Season, signed: Signed[Entry], read: ReadFile | None
-) -> list[Artefact]:
-    """The answers that are not null, each in the shape of its instance's challenge."""
-    entry, hidden = signed.content, list(season.hidden)
-    if len(entry.answers) != len(hidden):
-        raise Rejection(
-            "answer_missing",
-            f"answers: has {len(entry.answers)}: must have {len(hidden)}, one for each instance of "
-            f"the season {season.id}, null where the method failed.",
-        )
-    given, checked = [], set()
-    for number, (answer, each) in enumerate(zip(entry.answers, hidden, strict=True)):
-        if answer is None:
-            continue
-        if read is None:
-            check_stored(store, entry.submitter.key, answer)
-        # Many instances may have the same answers, which are read once for each shape.
-        form = answer.sha256, each.member.setting.action_dim
-        try:
-            if form not in checked:
-                data = (read or store.objects.read)(answer.sha256)
-                read_answers(data, each.member.setting, season.protocol)
-                checked.add(form)
-        except Rejection as error:
-            where = f"answers.{number} (class {each.member.name}, instance {each.instance})"
-            raise Rejection(error.code, f"{where}: {error.message}") from None
-        given.append(answer)
-    return given
-
-
-def refuse_other_season(signed: Signed[Entry] | Signed[TicketRequest], season: str) -> None:
-    """Reject what was sent to another season than the one of this digest, for which it is."""
-    if signed.content.season != season:
-        raise Rejection(
-            "season_unknown",
-            f"season={signed.content.season}: the {signed.content.FIELD} was sent to the season "
-            f"{season}. Send it to its own.",
-        )
-
-
-def refuse_other_sender(
-    store: SeasonStore, signed: Signed[TicketRequest], header: str | None, address: str
-) -> None:
-    """Reject a request whose header does not show that its own key has just sent it, here."""
-    sender = uploader(store.document, header, signed.id, address)
-    key = signed.content.submitter.key
-    if sender != key:
-        raise Rejection(
-            "bad_signature",
-            f"Authorization: is signed by the key {sender[:16]}…: must be by {key[:16]}…, "
-            "which signed the request. Sign both with one key.",
-        )
-
-
-def start_ticket(
-    store: SeasonStore, signed: Signed[TicketRequest], address: str | None = None
-) -> tuple[int, bool]:
-    """Start a ticket: its number, and whether it is new; `address` is as in `enter`."""
-    check_receiver(store.document, signed.receiver, address)
-    known = store.entrant(signed.id)
-    if known is not None:
-        return known.number, False
-    request = signed.content
-    if request.answers_key is None or request.transcript is None:
-        raise Rejection(
-            "schema",
-            "ticket.answers_key, ticket.transcript: missing: must be the public key that signs the "
-            "transcripts, and 1. Create the request with `sme-leaderboard ticket`.",
-        )
-    check_manifest(store.document, request, datetime.datetime.fromisoformat(store.time))
-    size = len(signed.to_bytes()) + played_bytes(store.season(request.season))
-    with store.transaction():  # no other entrant can take the name, or the room, in between
-        check_entrant(store, request.submitter, size)
-        return store.start_ticket(signed)

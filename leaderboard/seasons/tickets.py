@@ -1,5 +1,9 @@
 """`Ticket`: hidden tasks for one entrant, stepped by the board; `Sessions`: those of a season.
 
+The answer to a request for a ticket has the ticket's password, and a board keeps requests where
+others may read them. So a request is sent with a header `Authorization` as for an upload, whose
+signature is at most ten minutes old, and nobody else can repeat it.
+
 An instance without answers, or whose answers the entrant has not signed, scores 1 in every metric,
 whatever its steps.
 
@@ -21,15 +25,25 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from leaderboard.admission import check_entrant, check_manifest, uploader
+from leaderboard.documents.board import check_receiver
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.documents.submission import shifted, utc
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.scoring.aggregation import failed_run
-from leaderboard.seasons.events import SealedRow
+from leaderboard.scoring.ranking import failed_run
 from leaderboard.seasons.instance import Instance, has_signed, storage, write_whole
+from leaderboard.seasons.journal import played_bytes
 from leaderboard.seasons.scoring import HiddenTask, score_runs, sealed_result
-from leaderboard.seasons.season import MAX_LANES, AllHeads, Master, Place, SealedResult, Season
-from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.season import (
+    MAX_LANES,
+    AllHeads,
+    Master,
+    Place,
+    SealedResult,
+    Season,
+    TicketRequest,
+)
+from leaderboard.seasons.store import SealedRow, SeasonStore
 from leaderboard.store import Store
 from sme_registry import seasons
 from sme_registry.errors import SMEError
@@ -398,3 +412,39 @@ class ScoreTicket:
         masters = map(Master.read, self.secrets)
         master = next(each for each in masters if season.is_committed_to(each))
         finish_ticket(store, season, Ticket(store, season, master, row))
+
+
+def refuse_other_sender(
+    store: SeasonStore, signed: Signed[TicketRequest], header: str | None, address: str
+) -> None:
+    """Reject a request whose header does not show that its own key has just sent it, here."""
+    sender = uploader(store.document, header, signed.id, address)
+    key = signed.content.submitter.key
+    if sender != key:
+        raise Rejection(
+            "bad_signature",
+            f"Authorization: is signed by the key {sender[:16]}…: must be by {key[:16]}…, "
+            "which signed the request. Sign both with one key.",
+        )
+
+
+def start_ticket(
+    store: SeasonStore, signed: Signed[TicketRequest], address: str | None = None
+) -> tuple[int, bool]:
+    """Start a ticket: its number, and whether it is new; `address` is as in `enter`."""
+    check_receiver(store.document, signed.receiver, address)
+    known = store.entrant(signed.id)
+    if known is not None:
+        return known.number, False
+    request = signed.content
+    if request.answers_key is None or request.transcript is None:
+        raise Rejection(
+            "schema",
+            "ticket.answers_key, ticket.transcript: missing: must be the public key that signs the "
+            "transcripts, and 1. Create the request with `sme-leaderboard ticket`.",
+        )
+    check_manifest(store.document, request, datetime.datetime.fromisoformat(store.time))
+    size = len(signed.to_bytes()) + played_bytes(store.season(request.season))
+    with store.transaction():  # no other entrant can take the name, or the room, in between
+        check_entrant(store, request.submitter, size)
+        return store.add("ticket", signed)

@@ -35,22 +35,21 @@ from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.errors import Rejection
 from leaderboard.scoring.ranking import REASONS
 from leaderboard.scoring.worker import Job
-from leaderboard.seasons.events import SealedRow, SeasonRow
 from leaderboard.seasons.instance import Instance
-from leaderboard.seasons.scoring import by_key, counting, ranking_facts, season_rankings
+from leaderboard.seasons.scoring import by_key, counting, enter, ranking_facts, season_rankings
 from leaderboard.seasons.season import Entry, TicketRequest
-from leaderboard.seasons.store import (
-    SeasonStore,
-    enter,
-    refuse_other_season,
+from leaderboard.seasons.store import SealedRow, SeasonRow, SeasonStore
+from leaderboard.seasons.tickets import (
+    ScoreTicket,
+    Sessions,
+    attending,
     refuse_other_sender,
     start_ticket,
 )
-from leaderboard.seasons.tickets import ScoreTicket, Sessions, attending
 from leaderboard.store import Store
-from leaderboard.web import charts
-from leaderboard.web.http import HTTP_CODES, RequestError, metric_of, read_body
+from leaderboard.web import tables
 from leaderboard.web.pages import Pages, Section
+from leaderboard.web.server import HTTP_CODES, RequestError, metric_of, read_body
 from leaderboard.web.tables import setting_text
 from sme_registry import seasons
 from sme_registry.io import open_regular, to_json
@@ -111,7 +110,7 @@ def _entrants(store: SeasonStore, row: SeasonRow, counted: set[str]) -> list[dic
     """The entries or tickets of a season, for their table."""
     rows = store.entrants(row.digest)
     stepped = [_stepped(store, each) for each in rows]
-    drawn = iter(charts.sparklines([curve for _, curve in stepped if curve], "From the first step"))
+    drawn = iter(tables.sparklines([curve for _, curve in stepped if curve], "From the first step"))
     return [
         {
             "row": each,
@@ -414,3 +413,13 @@ def _signature(request: Request) -> str:
 
 def _octets(data: bytes) -> Response:
     return Response(data, media_type="application/octet-stream")
+
+
+def refuse_other_season(signed: Signed[Entry] | Signed[TicketRequest], season: str) -> None:
+    """Reject what was sent to another season than the one of this digest, for which it is."""
+    if signed.content.season != season:
+        raise Rejection(
+            "season_unknown",
+            f"season={signed.content.season}: the {signed.content.FIELD} was sent to the season "
+            f"{season}. Send it to its own.",
+        )

@@ -5,18 +5,21 @@ The signed log is authoritative, the other files hold the documents that it name
 next one continues from the state it leaves.
 """
 
-from leaderboard.store.blobs import (
+from leaderboard.documents.result import Copies, EntryRow
+from leaderboard.store.index import Index
+from leaderboard.store.log import (
+    EMPTY,
     Garbage,
+    Head,
+    Log,
+    LogEntry,
     Objects,
     collect_garbage,
     digest_of,
     expire_uploads,
     read_document,
 )
-from leaderboard.store.index import Index
-from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.queue import Claim, Queue
-from leaderboard.store.rows import Copies, EntryRow
 from leaderboard.store.store import Store, unknown_submission
 
 __all__ = [

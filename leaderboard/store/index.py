@@ -14,6 +14,7 @@ are no source of copies.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import functools
 import os
@@ -25,8 +26,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
 from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.result import Result, RunScore, Scores
+from leaderboard.documents.result import Copies, EntryRow, Result, RunScore, Scores, Status
 from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import (
     REFERENCE_FAMILY,
@@ -36,9 +39,17 @@ from leaderboard.documents.submission import (
     Withdrawal,
 )
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store.blobs import BUSY_SECONDS, Objects, digest_of, to_bytes, unwritable
-from leaderboard.store.log import EMPTY, Head, Log, LogEntry
-from leaderboard.store.rows import Copies, EntryRow, Status, sketches_alike
+from leaderboard.store.log import (
+    BUSY_SECONDS,
+    EMPTY,
+    Head,
+    Log,
+    LogEntry,
+    Objects,
+    digest_of,
+    to_bytes,
+    unwritable,
+)
 from sme_registry.io import is_regular
 from sme_registry.spec.document import StrictModel
 
@@ -459,3 +470,26 @@ def _expected() -> list[tuple[Any, ...]]:
     with contextlib.closing(_connect(":memory:")) as connection:
         connection.executescript(SCHEMA)
         return _definitions(connection)
+
+
+FEATURES, ALIKE, SAME_SCALE = 32, 0.001, 0.9
+
+
+def sketches_alike(one: str, others: list[str]) -> list[bool]:
+    """Which sketches of runs, of results of rules 2, are like one.
+
+    A sketch has, of both halves h of the states, K = 32 moments m_hk of a − a*, their mean variance
+    ν_h and a scale u_h, which may differ by a tenth; mean_k (m_hk − m'_hk)² is at most
+    ALIKE min(u_h, u'_h)² + 2 (ν_h + ν'_h). Numbers that are not finite are like no others.
+    """
+    data = b"".join(map(base64.b64decode, [one, *others]))
+    numbers = np.frombuffer(data, "<f4").astype(np.float64).reshape(len(others) + 1, -1)
+    x, y = numbers[0], numbers[1:]
+    with np.errstate(all="ignore"):
+        ratio = y[:, -2:] / x[-2:]
+        near = (ratio >= SAME_SCALE) & (ratio <= 1 / SAME_SCALE)
+        moments = (y[:, : 2 * FEATURES] - x[: 2 * FEATURES]).reshape(-1, 2, FEATURES)
+        noise = 2.0 * (y[:, -4:-2] + x[-4:-2])
+        scale = np.minimum(y[:, -2:], x[-2:])
+        within = (moments**2).mean(axis=2) <= ALIKE * scale**2 + noise
+    return [bool(each) for each in (near & within).all(axis=1)]

@@ -11,7 +11,7 @@ import contextlib
 import os
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
@@ -21,20 +21,25 @@ from leaderboard.documents.board import (
     Folder,
     refuse_unsubmittable,
 )
-from leaderboard.documents.result import Result
+from leaderboard.documents.result import EntryRow, Result
 from leaderboard.documents.signed import Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store.blobs import (
+from leaderboard.store.index import KINDS, Index, Kinds
+from leaderboard.store.log import (
+    EMPTY,
+    Clock,
     FolderLock,
+    Head,
+    Log,
+    LogEntry,
     Objects,
+    clock_offset,
     digest_of,
+    uptime,
     write_document,
 )
-from leaderboard.store.index import KINDS, Index, Kinds
-from leaderboard.store.log import EMPTY, Clock, Head, Log, LogEntry, clock_offset, uptime
 from leaderboard.store.queue import Queue
-from leaderboard.store.rows import EntryRow
 from sme_registry.io import build_folder
 from sme_registry.spec.document import StrictModel
 
@@ -326,18 +331,15 @@ class Store:
                 "otherwise stop what uses the board, and delete this file, which is then rebuilt."
             ) from error
 
-    def put_object(self, digest: str, chunks: Iterable[bytes], *, by: str) -> bool:
-        """Store an artefact of a key while its bytes arrive, up to the board's size limit.
+    def put_object(self, digest: str, data: bytes, *, by: str) -> bool:
+        """Store an artefact of a key; False if the key has uploaded or submitted it before.
 
-        The bytes are read and verified even if the board has them: they show that the uploader has
-        the artefact, too, and not only its digest. True if the key has neither uploaded nor
-        submitted it before. A `Rejection` is `too_large` or `artefact_digest`.
+        Its bytes show that the uploader has it, too, and not only its digest. A `Rejection` is
+        `too_large` or `artefact_digest`.
         """
         self.refuse_read_only()
         self.signing_key()  # without it no submission could follow
-        with self.transaction():  # so that `gc` does not remove it while its bytes arrive
-            self.objects.touch(digest)
-        size = self.objects.put(digest, chunks, self.document.limits.artefact_bytes)
+        self.objects.put(digest, data, self.document.limits.artefact_bytes)
         with self.transaction() as index:
             if not self.objects.touch(digest):
                 raise BoardError(f"artefact={digest}: was removed meanwhile. Upload it again.")
@@ -345,7 +347,7 @@ class Store:
             renewed = "UPDATE upload SET time = ? WHERE digest = ? AND key = ?"
             if execute(renewed, (time, digest, by)).rowcount or self.possesses(by, digest):
                 return False
-            execute("INSERT INTO upload VALUES (?, ?, ?, ?)", (digest, size, by, time))
+            execute("INSERT INTO upload VALUES (?, ?, ?, ?)", (digest, len(data), by, time))
         return True
 
     def receive(self, signed: Signed[Submission]) -> bool:

@@ -1,4 +1,4 @@
-"""`create_app`: a board over HTTP, with its pages and a small API.
+"""`create_app`: a board over HTTP, with its pages and a small API; `serve` runs it.
 
     GET  /…                              the pages, at the paths of `pages`
     PUT  /api/objects/<hex>              upload an artefact; signed, see `admission.uploads`
@@ -11,7 +11,7 @@
          /api/seasons/…                  sealed seasons, see `seasons.web`
     GET  /healthz                        200 while the server runs; scoring: ok, waiting or fault
 
-An error is {"code", "message"}: the code of a `Rejection`, or one of `http.HTTP_CODES`. The
+An error is {"code", "message"}: the code of a `Rejection`, or one of `server.HTTP_CODES`. The
 server keeps no sessions and sets no cookies; every request that changes the board is signed.
 """
 
@@ -21,11 +21,13 @@ import contextlib
 import hashlib
 import os
 import re
+import signal
 from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import anyio
+import uvicorn
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from starlette.exceptions import HTTPException
@@ -41,11 +43,11 @@ from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.gate.isolation import Isolation, available_isolation
 from leaderboard.scoring.worker import Work, background_scorers
 from leaderboard.store import Head, Store, unknown_submission
-from leaderboard.web import http
-from leaderboard.web.http import HTTP_CODES, RequestError
+from leaderboard.web import server
+from leaderboard.web.client import public_view
 from leaderboard.web.pages import Pages, Section, content_type
-from leaderboard.web.tables import public_view
-from sme_registry.errors import SMEError
+from leaderboard.web.server import HTTP_CODES, RequestError
+from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import server_address
 
 _Board: type[Store] = Store
@@ -103,14 +105,14 @@ def create_app(
         redoc_url=None,
         openapi_url=None,
         exception_handlers={
-            Rejection: http.on_rejection,
-            RequestError: http.on_rejection,
-            HTTPException: http.on_http_error,
-            SMEError: http.on_board_error,
+            Rejection: server.on_rejection,
+            RequestError: server.on_rejection,
+            HTTPException: server.on_http_error,
+            SMEError: server.on_board_error,
         },
     )
-    app.state.scores = score_workers > 0  # see `http.on_board_error`
-    app.add_middleware(http.SecurityHeaders)
+    app.state.scores = score_workers > 0  # see `server.on_board_error`
+    app.add_middleware(server.SecurityHeaders)
     for track in tracks:
         app.router.routes.extend(track.routes)
     app.add_api_route("/healthz", routes.health)
@@ -179,11 +181,11 @@ class _Routes:
 
         def put(data: bytes) -> bool:
             admission.check_upload(self._store, key, len(data))
-            return self._store.put_object(digest, [data], by=key)
+            return self._store.put_object(digest, data, by=key)
 
         async with self._objects:
             limit = self._store.document.limits.artefact_bytes
-            data = await http.read_body(request, limit, "object")
+            data = await server.read_body(request, limit, "object")
             new = await to_thread.run_sync(put, data, limiter=self._uploads)
         return JSONResponse({"digest": digest}, 201 if new else 200)
 
@@ -203,7 +205,7 @@ class _Routes:
         return Response(data, headers=headers, media_type="application/octet-stream")
 
     async def post_submission(self, request: Request) -> Response:
-        text = await http.read_body(request, MAX_BYTES, "submission")
+        text = await server.read_body(request, MAX_BYTES, "submission")
 
         # Garbage without a valid signature never waits with submissions, whose check is longer.
         signed = await to_thread.run_sync(Signed[Submission].read, text, limiter=self._documents)
@@ -222,7 +224,7 @@ class _Routes:
         return await self._cached(request, _view, _digest(digits), "application/json")
 
     async def post_withdrawal(self, request: Request) -> Response:
-        text = await http.read_body(request, MAX_BYTES, "withdrawal")
+        text = await server.read_body(request, MAX_BYTES, "withdrawal")
 
         def withdraw() -> str:
             signed = Signed[Withdrawal].read_unverified(text)
@@ -233,7 +235,7 @@ class _Routes:
         return JSONResponse({"id": id, "status": "withdrawn"})
 
     async def get_board(self, request: Request) -> Response:
-        name = f"{RANKED[http.metric_of(request)].stem}.json"
+        name = f"{RANKED[server.metric_of(request)].stem}.json"
         return await self._cached(request, _page, name, "application/json")
 
     async def get_log(self, request: Request) -> Response:
@@ -348,3 +350,64 @@ def _digest(digits: str) -> str:
             "'sha256:'.",
         )
     return f"sha256:{digits}"
+
+
+# Its characters need no quotes in the commands that the pages show.
+_PUBLIC_URL = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:]+\])(:\d{1,5})?(/[\w.~-]+)*/?", re.ASCII)
+
+
+def serve(
+    path: str | os.PathLike[str],
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    workers: int = 1,
+    announce: Callable[[str], None] = print,
+    url: str = "",
+    behind_proxy: bool = False,
+    unsafe_no_sandbox: bool = False,
+    season_secrets: Iterable[str | os.PathLike[str]] = (),
+) -> None:
+    """Serve a board and run its scorers until Ctrl-C or SIGTERM, which both end it cleanly.
+
+    Call it in the main thread, where signals arrive. Any address but the loopback needs
+    `behind_proxy`; port 0 is any free one; `announce` gets the URL once it listens. What is sent is
+    signed for `url`, by default where it listens. With `unsafe_no_sandbox`, submitted policies
+    could read the files of this account and use the network: nobody else may submit.
+    """
+    if url and not _PUBLIC_URL.fullmatch(url):
+        raise OptionError(
+            f"url={url!r:.80}: must be http(s)://host[:port][/path]. Give the address at which "
+            "others reach the board."
+        )
+    if not behind_proxy and not server.is_loopback(host):
+        raise OptionError(
+            f"host={host!r:.80}: must be a loopback address, such as 127.0.0.1. Put a reverse "
+            "proxy in front of it; if only the proxy reaches this address, add --behind-proxy."
+        )
+    secrets = list(season_secrets)
+    if unsafe_no_sandbox and workers and secrets:
+        raise OptionError(
+            "unsafe_no_sandbox=True: must be False with season_secrets, which submitted policies "
+            "could read. Install bubblewrap, or score no submissions (--workers 0)."
+        )
+    if behind_proxy and not url:
+        raise OptionError(
+            "url='': must be the address at which the proxy is reached, such as "
+            "https://board.example: what is sent to a board is signed for its address."
+        )
+    with server.listen(host, port) as listener:
+        app = create_app(
+            path,
+            url or server.url_of(listener),
+            score_workers=workers,
+            isolation="process" if unsafe_no_sandbox else "bwrap",
+            season_secrets=secrets,
+        )
+        announce(server.url_of(listener))
+        # Uvicorn shuts down on both signals, then raises the one it received.
+        previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            with contextlib.suppress(KeyboardInterrupt):
+                uvicorn.Server(server.config_of(app)).run(sockets=[listener])
+        finally:
+            signal.signal(signal.SIGTERM, previous)

@@ -27,11 +27,15 @@ from typing import Any, NamedTuple
 from leaderboard.admission import upload_header
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
+from leaderboard.documents.result import (
+    Result,
+)
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
-from leaderboard.documents.submission import Withdrawal, now
-from leaderboard.errors import CODES, BoardError, Rejection
-from leaderboard.store import EMPTY, Head, Log, LogEntry, Objects, Store, digest_of
-from leaderboard.store.blobs import unwritable, write_document, write_file
+from leaderboard.documents.submission import Submission, Withdrawal, now
+from leaderboard.errors import CODES, BoardError, NotPublishable, Rejection
+from leaderboard.scoring import ranking
+from leaderboard.store import EMPTY, EntryRow, Head, Log, LogEntry, Objects, Store, digest_of
+from leaderboard.store.log import unwritable, write_document, write_file
 from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
 from sme_registry.io import parse_json, server_address, sha256_of
 from sme_registry.seasons.wire import Connection
@@ -395,3 +399,90 @@ class _Copy:
 
     def _refusal(self, message: str) -> BoardError:
         return BoardError(f"{self._served.url}: {message}. Nothing of it was written.")
+
+
+_TEXTS = ("id", "status", "received", "withheld", "not_ranked", "fault")
+_NUMBERS = ("place", "queue", "faults")
+
+
+@dataclass(frozen=True)
+class PublicView:
+    """What the board publishes about one submission."""
+
+    id: str
+    status: str
+    received: str
+    signed: Signed[Submission]
+    result: Result | None  # None before scoring, and while its scores are withheld
+    withheld: str  # why the scores are withheld; empty if they are not
+    withdrawal: Signed[Withdrawal] | None
+    not_ranked: str = ""  # by any metric, a key of `ranking.REASONS`; empty without scores
+    copy_of: tuple[tuple[str, int], ...] = ()  # of other keys: ids, and the number of runs alike
+    place: int = 0  # in the queue, from 1; 0 if it does not wait
+    queue: int = 0  # how many wait, if it does
+    faults: int = 0  # of the board's machine, which ended its scoring while it waits
+    fault: str = ""  # the last of them
+
+    @classmethod
+    def from_dict(cls, plain: dict[str, Any]) -> PublicView:
+        """The view that `to_dict` wrote, here or in an earlier version of a served board."""
+        try:
+            result, withdrawal = plain["result"], plain["withdrawal"]
+            signed = {name: plain[name] for name in ("submission", "signature")}
+            signed |= {name: plain.get(name) for name in Receiver._fields}  # absent in older ones
+            values: dict[str, Any] = {name: str(plain.get(name, "")) for name in _TEXTS}
+            values |= {name: int(plain.get(name, 0)) for name in _NUMBERS}
+            view = cls(
+                **values,
+                signed=Signed[Submission].from_dict(signed),
+                result=None if result is None else Result.from_dict(result),
+                withdrawal=None if withdrawal is None else Signed[Withdrawal].from_dict(withdrawal),
+                copy_of=tuple((str(x["id"]), int(x["runs"])) for x in plain.get("copy_of", ())),
+            )
+        except SpecError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise SpecError(f"submission: invalid answer: {error!r:.200}. Check the URL.") from None
+        if view.signed.id != view.id:
+            raise SpecError(
+                f"id={view.id!r:.80}: the submission has another digest. Check the URL."
+            )
+        return view
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            **{name: getattr(self, name) for name in (*_TEXTS, *_NUMBERS)},
+            **self.signed.to_dict(),
+            "result": self.result and self.result.to_dict(),
+            "withdrawal": self.withdrawal and self.withdrawal.to_dict(),
+            "copy_of": [{"id": id, "runs": runs} for id, runs in self.copy_of],
+        }
+
+
+def public_view(store: Store, entry: EntryRow) -> PublicView:
+    """The public view of a submission; it has scores only while the board is publishable."""
+    result, entries = store.result(entry.id), store.entries()
+    queue = store.queue.places()
+    withheld, reason = "", ""
+    if result is not None and result.scores is not None:
+        try:
+            ranking.refuse_unpublishable(entries)
+            rows = ranking.ranking(entries, "wd_regret")
+            reason = next((row.reason for row in rows if row.entry.id == entry.id), "")
+        except NotPublishable as error:
+            result, withheld = None, str(error)
+    return PublicView(
+        id=entry.id,
+        status=entry.status,
+        received=entry.received,
+        signed=store.submission(entry.id),
+        result=result,
+        withheld=withheld,
+        withdrawal=store.withdrawal(entry.id),
+        not_ranked=reason,
+        copy_of=() if withheld else tuple((each.id, each.runs) for each in entry.copy_of),
+        place=queue.get(entry.id, 0),
+        queue=len(queue) if entry.id in queue else 0,
+        faults=entry.faults,
+        fault=entry.fault,
+    )

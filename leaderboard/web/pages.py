@@ -20,7 +20,6 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -30,11 +29,13 @@ from leaderboard.documents.result import METRICS, RANKED, Estimate, Metric, Resu
 from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import CODES, NotPublishable
+from leaderboard.gate import networks
 from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, Store
-from leaderboard.web import charts, tables
+from leaderboard.web import tables
 from leaderboard.web.tables import SHORT
 from sme_registry import SMESpec
+from sme_registry.explorer import STATIC
 from sme_registry.io import to_json
 
 _HERE = Path(__file__).parent
@@ -172,7 +173,7 @@ class Pages:
         ranked = ranking.ranking(self.entries, metric)
         scores = [row.entry.scores for row in ranked if row.entry.scores]
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
-        sparks = charts.sparklines(regrets)
+        sparks = tables.sparklines(regrets)
         submitted = [row for row in ranked if not row.entry.reference]
         return self.render(
             "board.html",
@@ -188,7 +189,7 @@ class Pages:
             reasons=ranking.REASONS,
             names={id: f"{entry.method} {entry.version}" for id, entry in self._by_id.items()},
             **self._overview,
-            bars=charts.Bars([row.shown(metric) for row in ranked], tab.references),
+            bars=tables.Bars([row.shown(metric) for row in ranked], tab.references),
             sparks=dict(zip((row.entry.id for row in ranked), sparks, strict=True)),
         )
 
@@ -230,8 +231,8 @@ class Pages:
         chart, classes = "", []
         if result is not None and result.scores is not None:
             name = submission.method.name
-            chart = charts.regret_chart(result.scores.normalised_regret, edges, name)
-            sparks = charts.sparklines([each.normalised_regret for each in result.classes])
+            chart = tables.regret_chart(result.scores.normalised_regret, edges, name)
+            sparks = tables.sparklines([each.normalised_regret for each in result.classes])
             classes = list(zip(result.classes, sparks, strict=True))
         versions = tables.versions_of(entry, self._listed)
         return self.render(
@@ -254,7 +255,7 @@ class Pages:
             chart=chart,
             classes=classes,
             agents=[] if result is None else tables.agent_rows(self.document, submission, result),
-            regions=charts.region_labels(edges),
+            regions=tables.region_labels(edges),
             runs=tables.run_rows(submission, result, self._class_of),
             explored=self._explored(id),
         )
@@ -262,7 +263,7 @@ class Pages:
     def _compare(self) -> str:
         """The page on which `board.js` compares chosen entries."""
         estimates = [each for entry in self._scored for each in entry.scores.normalised_regret]
-        chart = charts.comparison_chart(estimates, self.document.protocol.edges)
+        chart = tables.comparison_chart(estimates, self.document.protocol.edges)
         return self.render(
             "compare.html", here="compare.html", title="Compare entries", chart=chart
         )
@@ -285,7 +286,7 @@ class Pages:
         )
 
     def _method(self) -> str:
-        regions = charts.region_labels(self.document.protocol.edges)
+        regions = tables.region_labels(self.document.protocol.edges)
         return self.render("method.html", here="method.html", title="Method", regions=regions)
 
     def _suite(self) -> str:
@@ -302,7 +303,7 @@ class Pages:
             return [x if x is None else round(x, 5) + 0.0 for x in (estimate.value, *ends)]
 
         data = {
-            "regions": charts.region_labels(self.document.protocol.edges),
+            "regions": tables.region_labels(self.document.protocol.edges),
             "metrics": [text.label[0].upper() + text.label[1:] for text in METRICS.values()],
             "entries": [
                 {
@@ -367,15 +368,7 @@ class Pages:
         assert run.artefact is not None  # it is explored
         data = self.store.objects.read(run.artefact.sha256)
         title = f"{method.name} {method.version}"
-        page: str = self._explorer_pages.explorer(title, data, self._shown[run.spec])
-        return page.encode()
-
-    @cached_property
-    def _explorer_pages(self) -> ModuleType:
-        """The module for explorers, which takes a second to import."""
-        from leaderboard.web import explorers
-
-        return explorers
+        return networks.explorer(title, data, self._shown[run.spec]).encode()
 
     @cached_property
     def _shown(self) -> dict[str, SMESpec]:
@@ -383,7 +376,7 @@ class Pages:
         return {
             digest: spec.named(f"{name}, instance {digest[7:19]}")
             for digest, (name, spec) in self.document.instances.items()
-            if self._explorer_pages.can_show(spec)
+            if networks.can_show(spec)
         }
 
     @cached_property
@@ -392,7 +385,7 @@ class Pages:
         files = _static(*self._folders)
         if not self._explorers:
             return files
-        of_explorers = self._explorer_pages.STATIC.items()
+        of_explorers = STATIC.items()
         return {**files, **{name: text.encode() for name, text in of_explorers}}
 
     @cached_property
@@ -478,7 +471,7 @@ def _environment(*folders: Path) -> Environment:
         "hex": hex_of,
         "https_only": tables.https_only,
         "minute": tables.minute,
-        "number": charts.number,
+        "number": tables.number,
         "short": tables.short,
         "steps": tables.steps_text,
     }

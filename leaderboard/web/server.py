@@ -1,4 +1,4 @@
-"""A board for others: `serve` is the application under uvicorn, `write_site` a folder of pages.
+"""What all routes share, and a folder of pages instead of a server.
 
 Clients that are silent, slow or too many are the business of the reverse proxy in front of it,
 whose configuration is examples/deploy/nginx.conf: it passes on complete requests only. So this
@@ -7,102 +7,223 @@ server listens on this machine alone, unless it is told that a proxy is in front
 
 from __future__ import annotations
 
-import contextlib
+import html
 import ipaddress
-import os
+import logging
 import re
-import signal
 import socket
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import uvicorn
+from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from leaderboard.documents.board import Folder
-from leaderboard.errors import BoardError
+from leaderboard.documents.result import RANKED, Metric
+from leaderboard.errors import BoardError, ClockError, NotPublishable, Rejection
 from leaderboard.store import Store
-from leaderboard.store.blobs import write_file
+from leaderboard.store.log import write_file
 from leaderboard.web.pages import Pages, Section
 from sme_registry.errors import OptionError
-from sme_registry.io import require_packages
 
-if TYPE_CHECKING:
-    import uvicorn
-    from fastapi import FastAPI
+HTTP_CODES = {
+    "not_found": "nothing exists at this address",
+    "method_not_allowed": "this address does not accept this method",
+    "not_publishable": "a reference row is missing, waiting or off",
+    "bad_request": "the request is invalid",
+    "season_not_served": "this server does not have the season's secret, and cannot step its tasks",
+    "clock_wrong": "the server's clock is wrong, and nothing is written until it is set",
+    "internal": "the server failed; its log has the details",
+}
+
+STATUSES = {
+    code: status
+    for status, codes in {
+        400: "not_json unsafe_name",
+        403: "bad_signature wrong_board stale_time token_wrong not_admitted",
+        404: "unknown_submission season_unknown ticket_unknown instance_unknown not_found",
+        405: "method_not_allowed",
+        409: "start_conflict step_conflict step_ahead budget_spent instance_phase answer_conflict",
+        410: "withdrawn ticket_ended",
+        413: "too_large",
+        429: "quota ticket_limit",
+        500: "internal",
+        503: "season_not_served clock_wrong not_publishable",
+        507: "storage_full",
+    }.items()
+    for code in codes.split()
+}
+"""Any other code of a `Rejection` is 422, any other code is 400."""
+
+_RETRY_SECONDS = 5
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+        "connect-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
+_ENCODED = re.compile(rb"%(2f|5c|00)|\\", re.IGNORECASE)
+_log = logging.getLogger(__name__)
+
+
+class RequestError(Exception):
+    """A request that fails for a reason in `HTTP_CODES`."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(f"{code}: {message}")
+        self.code = code
+        self.message = message
+
+
+async def read_body(request: Request, limit: int, name: str) -> bytes:
+    """A whole body; one of more than `limit` bytes is `too_large`, and no more of it is kept."""
+    too_large = Rejection(
+        "too_large", f"{name}: must be at most {limit:,} bytes. Send a smaller one."
+    )
+    if int(request.headers.get("Content-Length", 0)) > limit:  # the HTTP parser admits digits only
+        raise too_large
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > limit:
+            raise too_large
+    return bytes(body)
+
+
+class SecurityHeaders:
+    """ASGI middleware: security headers; refuses unsafe paths, logs internal faults, hides them."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started = False
+
+        async def send_with_headers(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = True
+                headers = MutableHeaders(scope=message)
+                headers.update(_HEADERS)
+                headers.setdefault("Cache-Control", "no-store")
+            await send(message)
+
+        request = Request(scope)
+        if not _is_safe(scope):
+            answer = error_answer(
+                request,
+                "unsafe_name",
+                "path: '..', encoded slashes and backslashes are not allowed. Correct the address.",
+            )
+            await answer(scope, receive, send_with_headers)
+            return
+        try:
+            await self._app(scope, receive, send_with_headers)
+        except ClientDisconnect:  # nobody is left to answer
+            return
+        except Exception:
+            _log.exception("%s %s failed", scope["method"], scope["path"])
+            if started:
+                raise
+            answer = error_answer(request, "internal", f"{HTTP_CODES['internal']}.")
+            await answer(scope, receive, send_with_headers)
+
+
+def _is_safe(scope: Scope) -> bool:
+    raw, path = scope.get("raw_path") or b"", scope["path"]
+    return (
+        not _ENCODED.search(raw) and not {".", ".."} & set(path.split("/")) and path.isprintable()
+    )
+
+
+async def on_rejection(request: Request, error: Exception) -> Response:
+    assert isinstance(error, Rejection | RequestError)
+    return error_answer(request, error.code, error.message)
+
+
+async def on_http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    code = {404: "not_found", 405: "method_not_allowed"}.get(error.status_code, "bad_request")
+    return error_answer(request, code, f"{HTTP_CODES[code]}.", headers=error.headers)
+
+
+async def on_board_error(request: Request, error: Exception) -> Response:
+    """The answer where the board publishes nothing; every other fault is logged and hidden."""
+    if isinstance(error, ClockError):
+        _log.error("%s", error)
+        return error_answer(request, "clock_wrong", f"{HTTP_CODES['clock_wrong']}.")
+    if not isinstance(error, NotPublishable):
+        raise error
+    waits = error.waiting and request.app.state.scores
+    headers = {"Retry-After": str(_RETRY_SECONDS)} if waits else None
+    return error_answer(request, "not_publishable", str(error), headers)
+
+
+def error_answer(request: Request, code: str, message: str, headers: Any = None) -> Response:
+    """An error as JSON, or as a page if a browser asks for one."""
+    status = STATUSES.get(code, 400 if code in HTTP_CODES else 422)
+    is_api = request.url.path.startswith("/api/")
+    if is_api or "text/html" not in request.headers.get("Accept", ""):
+        return JSONResponse({"code": code, "message": message}, status, headers=headers)
+    page = _ERROR_PAGE.format(
+        status=status,
+        code=html.escape(code),
+        message=html.escape(message),
+        root="../" * (request.url.path.count("/") - 1) or "./",
+    )
+    return Response(page, status, headers=headers, media_type="text/html")
+
+
+_ERROR_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{status}</title>
+<link rel="stylesheet" href="{root}static/board.css">
+</head>
+<body>
+<main id="main" class="frame">
+<h1>{status}</h1>
+<p><code>{code}</code>: {message}</p>
+<p><a href="{root}">Back to the board</a></p>
+</main>
+</body>
+</html>
+"""
+
+
+def metric_of(request: Request) -> Metric:
+    """The metric that a request ranks by; WD regret by default."""
+    text = request.query_params.get("metric", "wd_regret")
+    for metric in RANKED:
+        if metric == text:
+            return metric
+    raise RequestError("bad_request", f"metric={text!r:.80}: must be one of {', '.join(RANKED)}.")
+
 
 _CONNECTIONS = 800  # and so fewer open files than the 1,024 that systems usually allow
 _HEAD_BYTES = 2**14
 _WRITERS = 8  # threads of `write_site` that wait for the disk
-# Its characters need no quotes in the commands that the pages show.
-_PUBLIC_URL = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:]+\])(:\d{1,5})?(/[\w.~-]+)*/?", re.ASCII)
 
 
-def serve(
-    path: str | os.PathLike[str],
-    host: str = "127.0.0.1",
-    port: int = 8000,
-    workers: int = 1,
-    announce: Callable[[str], None] = print,
-    url: str = "",
-    behind_proxy: bool = False,
-    unsafe_no_sandbox: bool = False,
-    season_secrets: Iterable[str | os.PathLike[str]] = (),
-) -> None:
-    """Serve a board and run its scorers until Ctrl-C or SIGTERM, which both end it cleanly.
-
-    Call it in the main thread, where signals arrive. Any address but the loopback needs
-    `behind_proxy`; port 0 is any free one; `announce` gets the URL once it listens. What is sent is
-    signed for `url`, by default where it listens. With `unsafe_no_sandbox`, submitted policies
-    could read the files of this account and use the network: nobody else may submit.
-    """
-    if url and not _PUBLIC_URL.fullmatch(url):
-        raise OptionError(
-            f"url={url!r:.80}: must be http(s)://host[:port][/path]. Give the address at which "
-            "others reach the board."
-        )
-    if not behind_proxy and not _is_loopback(host):
-        raise OptionError(
-            f"host={host!r:.80}: must be a loopback address, such as 127.0.0.1. Put a reverse "
-            "proxy in front of it; if only the proxy reaches this address, add --behind-proxy."
-        )
-    secrets = list(season_secrets)
-    if unsafe_no_sandbox and workers and secrets:
-        raise OptionError(
-            "unsafe_no_sandbox=True: must be False with season_secrets, which submitted policies "
-            "could read. Install bubblewrap, or score no submissions (--workers 0)."
-        )
-    if behind_proxy and not url:
-        raise OptionError(
-            "url='': must be the address at which the proxy is reached, such as "
-            "https://board.example: what is sent to a board is signed for its address."
-        )
-    require_packages("serving a board", {"fastapi": "FastAPI", "uvicorn": "uvicorn"}, "leaderboard")
-    import uvicorn
-
-    from leaderboard.web.app import create_app
-
-    with listen(host, port) as listener:
-        app = create_app(
-            path,
-            url or url_of(listener),
-            score_workers=workers,
-            isolation="process" if unsafe_no_sandbox else "bwrap",
-            season_secrets=secrets,
-        )
-        announce(url_of(listener))
-        # Uvicorn shuts down on both signals, then raises the one it received.
-        previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
-        try:
-            with contextlib.suppress(KeyboardInterrupt):
-                uvicorn.Server(server_config(app)).run(sockets=[listener])
-        finally:
-            signal.signal(signal.SIGTERM, previous)
-
-
-def server_config(app: FastAPI) -> uvicorn.Config:
-    import uvicorn
-
+def config_of(app: ASGIApp) -> uvicorn.Config:
     return uvicorn.Config(
         app,
         loop="asyncio",
@@ -118,7 +239,7 @@ def server_config(app: FastAPI) -> uvicorn.Config:
     )
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

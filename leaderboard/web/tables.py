@@ -1,4 +1,8 @@
-"""What the board's tables show, on pages, in files and in a terminal."""
+"""What the board's tables show, on pages, in files and in a terminal; and the pages' drawings.
+
+Drawings are inline SVG without styles, so that the pages can forbid inline styles. Their colours
+come from `board.css`, for light, dark and print. All text is escaped.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,12 @@ import csv
 import io
 import itertools
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from markupsafe import Markup, escape
 
 from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.result import (
@@ -19,15 +26,10 @@ from leaderboard.documents.result import (
     Result,
     RunScore,
 )
-from leaderboard.documents.signed import Receiver, Signed
-from leaderboard.documents.submission import Run, Submission, Withdrawal, skeleton
-from leaderboard.errors import NotPublishable
-from leaderboard.scoring import ranking
-from leaderboard.scoring.aggregation import class_mean, groups_of, never_listed
-from leaderboard.scoring.ranking import RankedRow
-from leaderboard.store import EntryRow, Store
+from leaderboard.documents.submission import Run, Submission, skeleton
+from leaderboard.scoring.ranking import RankedRow, class_mean, groups_of, never_listed
+from leaderboard.store import EntryRow
 from sme_registry import SMESpec
-from sme_registry.errors import SpecError
 from sme_registry.io import visible
 from sme_registry.io.markup import escape_latex
 from sme_registry.io.terminal import fixed
@@ -47,32 +49,18 @@ MARKS = {
 """Short names of the reasons in `ranking.REASONS`."""
 
 
-@dataclass(frozen=True)
-class TaskRow:
-    """A class of the suite."""
-
-    name: str
-    setting: str  # the fields that differ from a spec's defaults
-    runs: int  # that a rank needs
-    instances: list[tuple[int | str, str]]  # seed and digest of the first ones
-    more: int  # instances that are not listed
-
-
-def task_rows(document: BoardDocument) -> list[TaskRow]:
-    """The classes of a board's suite."""
-    rows = []
-    for member in document.suite.classes:
-        count, listed = len(member.seeds), member.instances[:_INSTANCES]
-        rows.append(
-            TaskRow(
-                name=member.name,
-                setting=setting_text(member.setting),
-                runs=count * document.runs_on_each(count),
-                instances=[(spec.seed, spec.digest) for spec in listed],
-                more=count - len(listed),
-            )
-        )
-    return rows
+def task_rows(document: BoardDocument) -> list[dict[str, Any]]:
+    """The classes of a board's suite, with the runs that a rank needs, and the first instances."""
+    return [
+        {
+            "name": member.name,
+            "setting": setting_text(member.setting),
+            "runs": len(member.seeds) * document.runs_on_each(len(member.seeds)),
+            "instances": [(spec.seed, spec.digest) for spec in member.instances[:_INSTANCES]],
+            "more": max(len(member.seeds) - _INSTANCES, 0),
+        }
+        for member in document.suite.classes
+    ]
 
 
 def setting_text(setting: Setting) -> str:
@@ -100,11 +88,7 @@ def versions_of(entry: EntryRow, entries: list[EntryRow]) -> list[EntryRow]:
 def run_rows(
     submission: Submission, result: Result | None, class_of: Mapping[str, str]
 ) -> list[tuple[str, Run | None, RunScore | None]]:
-    """Class name, run and score of the submitted runs, then of those started and not listed.
-
-    A result, None before scoring, lists the runs in the order of the submission. `class_of` has
-    the class name by the digest of an instance.
-    """
+    """Class name, run and score of the submitted runs, then of those started and not listed."""
     pairs = itertools.zip_longest(submission.runs, result.runs if result else ())
     return [
         (class_of.get(run.spec, "not in this suite") if run else score.class_name, run, score)
@@ -202,7 +186,6 @@ class RankingFile:
         }
 
     def to_csv(self) -> str:
-        """A header, then one line per entry; the last cells repeat the provenance."""
         stream = io.StringIO()
         # Text is always quoted, so that a spreadsheet that splits at semicolons keeps it in a cell.
         writer = csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\r\n")
@@ -302,88 +285,216 @@ def _interval(estimate: Estimate) -> str:
     return f"{value} [${fixed(low)}$, ${fixed(high)}$]"
 
 
-_TEXTS = ("id", "status", "received", "withheld", "not_ranked", "fault")
-_NUMBERS = ("place", "queue", "faults")
+Edges = Sequence[tuple[float, float]]
+
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+_MARGIN = 3.0  # % of a bar's width at either end, for a dot at the end
+_SPARK_WIDTH, _SPARK_HEIGHT = 84.0, 30.0
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 720.0, 360.0, 60.0, 708.0, 22.0, 296.0
+_MAX_LABELS = 12  # region labels below a chart
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number as in every table, with a true minus sign."""
+    return fixed(value, digits).replace("-", "\u2212")
 
 
 @dataclass(frozen=True)
-class PublicView:
-    """What the board publishes about one submission."""
+class Scale:
+    """An axis."""
 
-    id: str
-    status: str
-    received: str
-    signed: Signed[Submission]
-    result: Result | None  # None before scoring, and while its scores are withheld
-    withheld: str  # why the scores are withheld; empty if they are not
-    withdrawal: Signed[Withdrawal] | None
-    not_ranked: str = ""  # by any metric, a key of `ranking.REASONS`; empty without scores
-    copy_of: tuple[tuple[str, int], ...] = ()  # of other keys: ids, and the number of runs alike
-    place: int = 0  # in the queue, from 1; 0 if it does not wait
-    queue: int = 0  # how many wait, if it does
-    faults: int = 0  # of the board's machine, which ended its scoring while it waits
-    fault: str = ""  # the last of them
+    low: float
+    high: float  # more than `low`
+    ticks: tuple[float, ...]  # round numbers from end to end
 
     @classmethod
-    def from_dict(cls, plain: dict[str, Any]) -> PublicView:
-        """The view that `to_dict` wrote, here or in an earlier version of a served board."""
-        try:
-            result, withdrawal = plain["result"], plain["withdrawal"]
-            signed = {name: plain[name] for name in ("submission", "signature")}
-            signed |= {name: plain.get(name) for name in Receiver._fields}  # absent in older ones
-            values: dict[str, Any] = {name: str(plain.get(name, "")) for name in _TEXTS}
-            values |= {name: int(plain.get(name, 0)) for name in _NUMBERS}
-            view = cls(
-                **values,
-                signed=Signed[Submission].from_dict(signed),
-                result=None if result is None else Result.from_dict(result),
-                withdrawal=None if withdrawal is None else Signed[Withdrawal].from_dict(withdrawal),
-                copy_of=tuple((str(x["id"]), int(x["runs"])) for x in plain.get("copy_of", ())),
-            )
-        except SpecError:
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise SpecError(f"submission: invalid answer: {error!r:.200}. Check the URL.") from None
-        if view.signed.id != view.id:
-            raise SpecError(
-                f"id={view.id!r:.80}: the submission has another digest. Check the URL."
-            )
-        return view
+    def covering(cls, *values: float) -> Scale:
+        """The scale of about four round steps that covers the values."""
+        low, high = min(values, default=0.0), max(values, default=1.0)
+        high = high if high - low > 1e-9 else low + 1.0
+        raw = (high - low) / 4
+        power = 10.0 ** math.floor(math.log10(raw))
+        step = next(factor * power for factor in _STEPS if factor * power >= raw * (1 - 1e-9))
+        first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+        ticks = tuple(round(index * step, 12) + 0.0 for index in range(first, last + 1))
+        return cls(ticks[0], ticks[-1], ticks)
 
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            **{name: getattr(self, name) for name in (*_TEXTS, *_NUMBERS)},
-            **self.signed.to_dict(),
-            "result": self.result and self.result.to_dict(),
-            "withdrawal": self.withdrawal and self.withdrawal.to_dict(),
-            "copy_of": [{"id": id, "runs": runs} for id, runs in self.copy_of],
-        }
+    def part(self, value: float) -> float:
+        """The position of a value along the axis, in [0, 1]."""
+        return (min(max(value, self.low), self.high) - self.low) / (self.high - self.low)
 
 
-def public_view(store: Store, entry: EntryRow) -> PublicView:
-    """The public view of a submission; it has scores only while the board is publishable."""
-    result, entries = store.result(entry.id), store.entries()
-    queue = store.queue.places()
-    withheld, reason = "", ""
-    if result is not None and result.scores is not None:
-        try:
-            ranking.refuse_unpublishable(entries)
-            rows = ranking.ranking(entries, "wd_regret")
-            reason = next((row.reason for row in rows if row.entry.id == entry.id), "")
-        except NotPublishable as error:
-            result, withheld = None, str(error)
-    return PublicView(
-        id=entry.id,
-        status=entry.status,
-        received=entry.received,
-        signed=store.submission(entry.id),
-        result=result,
-        withheld=withheld,
-        withdrawal=store.withdrawal(entry.id),
-        not_ranked=reason,
-        copy_of=() if withheld else tuple((each.id, each.runs) for each in entry.copy_of),
-        place=queue.get(entry.id, 0),
-        queue=len(queue) if entry.id in queue else 0,
-        faults=entry.faults,
-        fault=entry.fault,
+class Bars:
+    """The bars of a table on one scale, with lines at the reference rows.
+
+    Hidden from screen readers, because the same numbers are in the next cell.
+    """
+
+    def __init__(self, estimates: Sequence[Estimate], references: Mapping[str, float]) -> None:
+        ends = (end for each in estimates for end in each.ends)
+        self._scale = Scale.covering(*ends, *references.values())
+        self._references = references
+        self._lines = "".join(
+            f'<line class="{escape(name)}" x1="{at}" x2="{at}" y1="0" y2="100%"/>'
+            for name, at in zip(references, map(self._at, references.values()), strict=True)
+        )
+
+    def bar(self, estimate: Estimate) -> Markup:
+        """A 95 % interval as a bar with a dot at its value, visible even without width."""
+        low, high, value = map(self._at, (*estimate.ends, estimate.value))
+        return Markup(
+            f'<svg class="bar" aria-hidden="true" focusable="false">{self._lines}'
+            f'<line class="ci" x1="{low}" x2="{high}" y1="50%" y2="50%"/>'
+            f'<circle class="dot" cx="{value}" cy="50%" r="4"/></svg>'
+        )
+
+    def axis(self) -> Markup:
+        """The axis above the bars, with the names of the reference lines."""
+        ticks = self._scale.ticks
+        parts = [
+            f'<text x="{self._at(tick)}" y="30">{_short(tick)}</text>'
+            for tick in ticks[:: 1 + len(ticks) // 4]
+        ]
+        names: dict[float, list[str]] = {}
+        for name, value in self._references.items():
+            names.setdefault(value, []).append(name)
+        parts += [
+            f'<text class="name {_anchor(self._scale.part(value))}" x="{self._at(value)}" y="12">'
+            f"{escape(', '.join(group))}</text>"
+            for value, group in names.items()
+        ]
+        return Markup(
+            f'<svg class="axis" aria-hidden="true" focusable="false">{"".join(parts)}</svg>'
+        )
+
+    def _at(self, value: float) -> str:
+        return f"{_MARGIN + (100 - 2 * _MARGIN) * self._scale.part(value):.2f}%"
+
+
+def sparklines(regrets: Sequence[Sequence[float]], label: str = "From WD outward") -> list[Markup]:
+    """Small curves on one scale: of N_m over the regions, WD first, or as the label says."""
+    scale = Scale.covering(0.0, 1.0, *itertools.chain.from_iterable(regrets))
+    return [_sparkline(regret, scale, label) for regret in regrets]
+
+
+def _sparkline(regret: Sequence[float], scale: Scale, label: str) -> Markup:
+    height = _SPARK_HEIGHT - 6
+    step = (_SPARK_WIDTH - 6) / max(1, len(regret) - 1)
+    optimal, constant, *ys = [
+        f"{_SPARK_HEIGHT - 3 - height * scale.part(value):.1f}" for value in (0.0, 1.0, *regret)
+    ]
+    points = " ".join(f"{3 + step * index:.1f},{y}" for index, y in enumerate(ys))
+    text = ", ".join(number(value, 2) for value in regret)
+    return Markup(
+        f'<svg class="spark" viewBox="0 0 {_SPARK_WIDTH:.0f} {_SPARK_HEIGHT:.0f}" role="img" '
+        f'aria-label="{label}: {text}">'
+        f'<path class="optimal" d="M0 {optimal}H{_SPARK_WIDTH:.0f}"/>'
+        f'<path class="constant" d="M0 {constant}H{_SPARK_WIDTH:.0f}"/>'
+        f'<polyline points="{points}"/>'
+        f'<circle cx="3" cy="{ys[0]}" r="2.5"/></svg>'
     )
+
+
+def region_labels(edges: Edges) -> list[str]:
+    """The regions on an axis: `WD`, `0–0.2`, …"""
+    return ["WD" if index == 0 else f"{low:g}–{high:g}" for index, (low, high) in enumerate(edges)]
+
+
+def regret_chart(regret: Sequence[Estimate], edges: Edges, name: str) -> Markup:
+    """Normalised regret of an entry over the regions, WD first, with intervals."""
+    axes = _Axes.covering(regret, edges)
+    points = [
+        (f"{axes.x(index):.1f}", *(f"{axes.y(y):.1f}" for y in (e.ends[0], e.value, e.ends[1])))
+        for index, e in enumerate(regret)
+    ]
+    band = [f"{x},{high}" for x, _, _, high in points]
+    band += [f"{x},{low}" for x, low, _, _ in reversed(points)]
+    line = [f"{x},{y}" for x, _, y, _ in points]
+    known = all(e.interval for e in regret)  # not where each class has a single run
+    marks = "".join(
+        (f'<path class="whisker" d="M{x} {low}V{high}m-5 0h10M{x} {low}m-5 0h10"/>' * known)
+        + f'<circle class="dot" cx="{x}" cy="{y}" r="4.5"/>'
+        for x, low, y, high in points
+    )
+    curve = (
+        f'<polygon class="band" points="{" ".join(band)}"/>' * known
+        + f'<polyline class="line" points="{" ".join(line)}"/>{marks}'
+    )
+    values = "; ".join(
+        f"{label}: {number(e.value)}"
+        + (f", from {number(e.ends[0])} to {number(e.ends[1])}" if e.interval else "")
+        for label, e in zip(region_labels(edges), regret, strict=True)
+    )
+    title = f"Normalised regret of {name} by region"
+    return axes.chart(title, f"{values}. 0 is the optimal policy, 1 the constant one.", curve)
+
+
+def comparison_chart(regret: Sequence[Estimate], edges: Edges) -> Markup:
+    """The axes of the comparison, which cover all entries and any choice of `board.js`."""
+    return _Axes.covering(regret, edges).chart("Normalised regret by region", "", "")
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """The axes of a chart of normalised regret over the regions."""
+
+    scale: Scale
+    regions: tuple[str, ...]
+
+    @classmethod
+    def covering(cls, regret: Sequence[Estimate], edges: Edges) -> _Axes:
+        scale = Scale.covering(0.0, 1.0, *(end for e in regret for end in e.ends))
+        return cls(scale, tuple(region_labels(edges)))
+
+    @property
+    def step(self) -> float:
+        return (_RIGHT - _LEFT) / len(self.regions)
+
+    def x(self, region: int) -> float:
+        return _LEFT + self.step * (region + 0.5)
+
+    def y(self, value: float) -> float:
+        return _BOTTOM - (_BOTTOM - _TOP) * self.scale.part(value)
+
+    def chart(self, title: str, description: str, curve: str) -> Markup:
+        """The axes and a curve, as SVG. Its data attributes let a script draw on the same axes."""
+        return Markup(
+            f'<svg class="profile" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
+            'aria-labelledby="chart-title chart-desc" '
+            f'data-left="{_LEFT:.0f}" data-step="{self.step:.3f}" '
+            f'data-zero="{self.y(0.0):.3f}" data-one="{self.y(1.0):.3f}">'
+            f'<title id="chart-title">{escape(title)}</title>'
+            f'<desc id="chart-desc">{escape(description)}</desc>{self._ticks()}{curve}</svg>'
+        )
+
+    def _ticks(self) -> str:
+        parts = [
+            f'<path class="grid" d="M{_LEFT:.0f} {self.y(tick):.1f}H{_RIGHT:.0f}"/>'
+            f'<text class="tick end" x="{_LEFT - 8:.0f}" y="{self.y(tick) + 4:.1f}">'
+            f"{_short(tick)}</text>"
+            for tick in self.scale.ticks
+        ]
+        parts += [
+            f'<path class="{name}" d="M{_LEFT:.0f} {self.y(value):.1f}H{_RIGHT:.0f}"/>'
+            f'<text class="tick label" x="{_RIGHT:.0f}" y="{self.y(value) - 6:.1f}">{label}</text>'
+            for name, value, label in (("optimal", 0.0, "optimal"), ("constant", 1.0, "constant ½"))
+        ]
+        every = 1 + (len(self.regions) - 1) // _MAX_LABELS
+        parts += [
+            f'<text class="tick middle" x="{self.x(index):.1f}" y="{_BOTTOM + 24:.0f}">'
+            f"{label}</text>"
+            for index, label in enumerate(self.regions)
+            if index % every == 0
+        ]
+        return "".join(parts) + (
+            f'<text class="tick middle" x="{(_LEFT + _RIGHT) / 2:.0f}" y="{_HEIGHT - 10:.0f}">'
+            "expansion ε beyond the training cube</text>"
+        )
+
+
+def _anchor(part: float) -> str:
+    return "start" if part < 0.2 else "end" if part > 0.8 else "middle"
+
+
+def _short(value: float) -> str:
+    return f"{value:g}".replace("-", "\u2212")

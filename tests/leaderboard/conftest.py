@@ -134,7 +134,7 @@ def put_submission(store, key, number=0, **fields):
     """`tiny_submission`, with its artefacts on the board and waiting to be scored."""
     signed, artefacts = tiny_submission(store, key, number, **fields)
     for digest, data in artefacts.items():
-        store.put_object(digest, [data], by=key.public)
+        store.put_object(digest, data, by=key.public)
     assert store.receive(signed)
     return signed
 
@@ -142,7 +142,7 @@ def put_submission(store, key, number=0, **fields):
 def put_policy(store, key, data, number=0):
     """`put_submission`, with one run: this artefact on the suite's first instance."""
     digest = sha256_of(data)
-    store.put_object(digest, [data], by=key.public)
+    store.put_object(digest, data, by=key.public)
     run = {
         "spec": store.document.suite.instances[0].digest,
         "seed": 0,

@@ -13,13 +13,13 @@ import uvicorn
 from leaderboard.admission import upload_header
 from leaderboard.documents.signed import Receiver
 from leaderboard.web.app import create_app
-from leaderboard.web.server import listen, server_config, url_of
+from leaderboard.web.server import config_of, listen, url_of
 
 # The server's five seconds to end become sixty: load logs no error.
 _SERVE = """
 import sys
 import uvicorn
-from leaderboard.web.server import serve
+from leaderboard.web.app import serve
 Config = uvicorn.Config
 uvicorn.Config = lambda *given, **named: Config(*given, **named | {"timeout_graceful_shutdown": 60})
 serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(url, flush=True))
@@ -33,7 +33,7 @@ def serving(path, seen=None, **options):
         app = create_app(path, options.pop("url", url_of(listener)), **options)
         if seen is not None:
             app.add_middleware(_Seen, seen=seen)
-        server = uvicorn.Server(server_config(app))
+        server = uvicorn.Server(config_of(app))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:

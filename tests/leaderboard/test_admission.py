@@ -27,7 +27,7 @@ ANY_TIME = "2000-01-01T00:00:00Z"
 
 def put(store, key, artefacts):
     for digest, data in artefacts.items():
-        store.put_object(digest, [data], by=key.public)
+        store.put_object(digest, data, by=key.public)
 
 
 def bundle(folder, signed, artefacts):
@@ -132,7 +132,7 @@ def test_a_key_submits_its_artefact_again_without_another_upload(store, key):
     # An upload without the bytes is no upload.
     copier = SigningKey.generate()
     (digest,) = artefacts
-    assert code_of(lambda: store.put_object(digest, [], by=copier.public)) == "artefact_digest"
+    assert code_of(lambda: store.put_object(digest, b"", by=copier.public)) == "artefact_digest"
     assert not store.possesses(copier.public, digest)
 
 

@@ -12,7 +12,7 @@ from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import MAX_BYTES, SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Submission, Training
 from leaderboard.errors import Rejection
-from leaderboard.gate.reference import constant_onnx, optimal_onnx
+from leaderboard.gate.networks import constant_onnx, optimal_onnx
 from sme_registry import SMESpec, save
 from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.spec import StudyFile, StudyPlan, Suite, SuiteFile

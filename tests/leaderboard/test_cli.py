@@ -14,7 +14,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from leaderboard.cli import app
-from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import SigningKey
 from leaderboard.gate import isolation
@@ -418,7 +418,7 @@ def test_a_board_without_its_key_accepts_nothing():
 
 def test_the_index_comes_back_from_the_files(scored, monkeypatch):
     # A ranking says when it was written, to the second.
-    monkeypatch.setattr("leaderboard.documents.submission.now", lambda: "2026-01-01T00:00:00Z")
+    monkeypatch.setattr("leaderboard.cli.results.now", lambda: "2026-01-01T00:00:00Z")
     before = good("rank", "board", "--csv")
     for path in Path("board").glob("index.sqlite*"):
         path.unlink()
@@ -433,7 +433,7 @@ def test_gc_removes_unnamed_artefacts_and_a_dry_run_only_counts_them(scored):
     data = linear_onnx(1)
     digest = sha256_of(data)
     with Store.open("board") as store:
-        store.put_object(digest, [data], by=key.public)
+        store.put_object(digest, data, by=key.public)
     assert "1 files" in good("admin", "gc", "board", "--older-than-hours", "0", "--dry-run")
     with Store.open("board") as store:
         assert store.objects.has(digest)

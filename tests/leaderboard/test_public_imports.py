@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import leaderboard
 from leaderboard.cli import app
 from leaderboard.documents.signed import SigningKey
-from leaderboard.web.tables import PublicView, public_view
+from leaderboard.web.client import PublicView, public_view
 from sme_registry.errors import SpecError
 from tests.leaderboard.web import boards
 

@@ -12,7 +12,7 @@ from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import Rejection
 from leaderboard.gate import sandbox
 from leaderboard.gate.isolation import available_isolation
-from leaderboard.gate.reference import optimal_onnx
+from leaderboard.gate.networks import optimal_onnx
 from leaderboard.scoring import ranking, score
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorer

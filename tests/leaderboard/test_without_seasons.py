@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.cli.submit import KEY_VARIABLE
 from tests.leaderboard.test_cli import furnish
 
 ROOT = Path(__file__).resolve().parents[2]

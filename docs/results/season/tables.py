@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from leaderboard.seasons.publication import MOST_ROWS, table_regret
+from leaderboard.seasons.cli import MOST_ROWS, table_regret
 from leaderboard.seasons.scoring import counting
 from leaderboard.seasons.season import SealedResult
 from leaderboard.seasons.store import SeasonStore

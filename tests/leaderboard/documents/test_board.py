@@ -7,16 +7,18 @@ from typer.testing import CliRunner
 
 from leaderboard.admission import check_submission
 from leaderboard.cli import app
-from leaderboard.cli.options import find_suite
+from leaderboard.cli.submit import find_suite
 from leaderboard.documents.board import MOST_LISTED, BoardDocument, Limits, refuse_unsubmittable
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.documents.submission import Submission, check_names
 from leaderboard.errors import BoardError, Rejection
+from leaderboard.seasons.season import SeasonClass
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 from sme_registry.errors import SpecError
 from sme_registry.spec import SuiteFile, catalogue
 from tests.leaderboard.conftest import document_of, plain_submission, suite_of
+from tests.leaderboard.seasons.sealing import tiny_season
 
 SUITE = suite_of(A=(2, {}), B=(1, {"complexity": 2}))
 LIMITS = Limits(artefact_bytes=1000, age_days=14)
@@ -238,22 +240,29 @@ def test_the_first_of_several_faults_is_reported(first):
 
 # Suites that no board scores
 
-LIMITED = {"safety": {"tightness": 0.2}}
-MIXED = {"observation": {"mixing": "orthogonal"}}
+MORE = {
+    "safety": {"tightness": 0.2},
+    "observation": {"mixing": "orthogonal"},
+    "shaping": {"scale": 0.5},
+    "noise": {"reward": 0.1},
+}
 
 
-@pytest.mark.parametrize("setting", [LIMITED, MIXED], ids=["safety", "observation"])
-def test_boards_refuse_classes_with_safety_or_observation(setting):
-    plain = BOARD.to_dict()
+@pytest.mark.parametrize("field", MORE)
+def test_boards_and_seasons_refuse_classes_with_more_than_a_plain_task(field):
+    plain, setting = BOARD.to_dict(), {field: MORE[field]}
     BoardDocument.from_dict(plain)
     suite = suite_of(Plain=(1, {}), Other=(1, setting))
-    with pytest.raises(SpecError, match=r"suite: has classes .* \(Other\), and a leaderboard"):
+    with pytest.raises(SpecError, match=rf"suite: has classes .*{field}.* \(Other\), and a"):
         BoardDocument.from_dict({**plain, "suite": suite.to_dict()})
+    member = {**tiny_season().to_dict()["classes"][0]}
+    with pytest.raises(SpecError, match=f"{field}: must be null in a sealed season"):
+        SeasonClass.from_dict({**member, "setting": {**member["setting"], **setting}})
 
 
 @pytest.mark.parametrize("name", ["safety", "representation"])
 def test_commands_refuse_the_suites_of_the_catalogue_that_boards_do_not_score(name, tmp_path):
-    with pytest.raises(SpecError, match="safety or observation"):
+    with pytest.raises(SpecError, match="safety, observation, shaping or noise"):
         find_suite(name)
     result = CliRunner().invoke(app, ["init", f"{tmp_path}/board", "--suite", name])
     assert result.exit_code == 2, result.output

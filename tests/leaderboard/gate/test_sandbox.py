@@ -17,8 +17,8 @@ from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.gate import child, sandbox
 from leaderboard.gate import isolation as isolations
+from leaderboard.gate.networks import network_of
 from leaderboard.gate.sandbox import ROWS, Sandbox, SandboxLimits, inspect_own
-from leaderboard.web.explorers import network_of
 from sme_registry.errors import MissingDependencyError, StateError
 from tests.leaderboard.gate import models
 from tests.leaderboard.gate.models import (

@@ -9,7 +9,7 @@ import pytest
 
 from leaderboard.documents.board import Folder
 from leaderboard.documents.signed import SigningKey
-from leaderboard.scoring.aggregation import never_listed, result_of
+from leaderboard.scoring.ranking import never_listed, result_of
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import LogEntry, Objects, Store
 from sme_registry.io import to_json

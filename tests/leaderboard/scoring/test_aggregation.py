@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
 from leaderboard.documents.submission import Submission
-from leaderboard.scoring.aggregation import (
+from leaderboard.scoring.ranking import (
     failed_run,
     is_oracle_like,
     never_listed,

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
-from leaderboard.scoring.aggregation import run_metrics
-from leaderboard.scoring.ranking import rank_ranges
-from leaderboard.seasons.publication import table_regret
+from leaderboard.scoring.ranking import rank_ranges, run_metrics
+from leaderboard.seasons.cli import table_regret
 from leaderboard.seasons.scoring import instances, score_runs
 from leaderboard.seasons.season import Place
 from sme_registry import evaluate

@@ -16,7 +16,7 @@ from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import available_isolation
-from leaderboard.gate.reference import constant_onnx, optimal_onnx
+from leaderboard.gate.networks import constant_onnx, optimal_onnx
 from leaderboard.scoring import score as score_module
 from leaderboard.scoring.score import evaluation_seed, score_submission
 from sme_registry import EvaluationProtocol, evaluate

@@ -11,8 +11,7 @@ from leaderboard.documents.board import Folder, hex_of
 from leaderboard.documents.result import Result
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.scoring.aggregation import levels_of, run_metrics
-from leaderboard.scoring.ranking import ranking, refuse_unpublishable
+from leaderboard.scoring.ranking import levels_of, ranking, refuse_unpublishable, run_metrics
 from leaderboard.scoring.score import evaluation_seed
 from leaderboard.scoring.verify import Difference, Note, Row, difference, draw, verify
 from leaderboard.seasons.store import SeasonStore

@@ -17,8 +17,7 @@ import pytest
 from leaderboard import admission
 from leaderboard.errors import BoardError, ScoringFault, TamperedError
 from leaderboard.scoring import worker as scorer
-from leaderboard.scoring.aggregation import failed_run, result_of
-from leaderboard.scoring.ranking import refuse_unpublishable
+from leaderboard.scoring.ranking import failed_run, refuse_unpublishable, result_of
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import background_scorers, run_scorer, run_scorers
 from leaderboard.store import Queue, Store

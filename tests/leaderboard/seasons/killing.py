@@ -28,7 +28,7 @@ from tests.leaderboard.seasons.playing import LANES
 
 _SERVE = """
 import sys
-from leaderboard.web.server import serve
+from leaderboard.web.app import serve
 board, secret, port = sys.argv[1:]
 serve(board, port=int(port), workers=0, announce=lambda url: print(url, flush=True),
       season_secrets=[secret])

@@ -14,8 +14,8 @@ from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
 from leaderboard.seasons.entrant import request_ticket, signer_of
 from leaderboard.seasons.season import Season, TicketRequest
-from leaderboard.seasons.store import SeasonStore, start_ticket
-from leaderboard.seasons.tickets import Sessions, Ticket, score_ticket
+from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.tickets import Sessions, Ticket, score_ticket, start_ticket
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import (
     Chain,

@@ -4,10 +4,10 @@ import datetime
 
 from leaderboard.documents.signed import Receiver
 from leaderboard.documents.submission import now, utc
-from leaderboard.scoring.aggregation import failed_run
+from leaderboard.scoring.ranking import failed_run
+from leaderboard.seasons.publication import verify_seasons
 from leaderboard.seasons.scoring import sealed_result
 from leaderboard.seasons.season import Entry, Master, Stepping, Terms, TicketRequest
-from leaderboard.seasons.verify import verify_seasons
 from sme_registry import EvaluationProtocol
 
 MASTER = Master(bytes(range(32)))

@@ -8,7 +8,7 @@ from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.verify import verify
-from leaderboard.seasons import store as entries
+from leaderboard.seasons import scoring as entries
 from leaderboard.seasons.season import MAX_OFFLINE_INSTANCES, Entry
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.errors import SpecError
@@ -79,10 +79,10 @@ def test_answers_are_uploads_of_the_entrants_key(store, key):
     signed = entry(store, key, GOOD, GOOD)
     for other in (None, SigningKey.generate()):
         if other is not None:
-            store.put_object(sha256_of(GOOD), [GOOD], by=other.public)
+            store.put_object(sha256_of(GOOD), GOOD, by=other.public)
         with pytest.raises(Rejection, match="artefact_missing"):
             entries.enter(store, signed)
-    store.put_object(sha256_of(GOOD), [GOOD], by=key.public)
+    store.put_object(sha256_of(GOOD), GOOD, by=key.public)
     assert entries.enter(store, signed)
 
 
@@ -114,21 +114,21 @@ def test_the_same_answers_must_fit_each_class(store, key):
 
 def test_what_changes_between_the_check_and_the_record_is_checked_again(store, key, monkeypatch):
     signed, path = entry(store, key, GOOD, None), store.folder.object(sha256_of(GOOD))
-    room = "leaderboard.seasons.store.check_entrant"
+    room = "leaderboard.seasons.scoring.check_entrant"
     with monkeypatch.context() as patch:  # as `gc` of another process
         patch.setattr(room, lambda *_: path.unlink())
-        store.put_object(sha256_of(GOOD), [GOOD], by=key.public)
+        store.put_object(sha256_of(GOOD), GOOD, by=key.public)
         with pytest.raises(Rejection, match="artefact_missing"):
             entries.enter(store, signed)
 
     def taken(*arguments):
         other = SigningKey.generate()
         name = {"name": f"Tester {key.public[:8]}", "key": other.public}
-        store.enter(signed_entry(store, SEASON, other, [None, None], submitter=name))
+        store.add("entry", signed_entry(store, SEASON, other, [None, None], submitter=name))
         return check_answers(*arguments)
 
     check_answers = entries._check_answers
-    monkeypatch.setattr("leaderboard.seasons.store._check_answers", taken)
+    monkeypatch.setattr("leaderboard.seasons.scoring._check_answers", taken)
     with pytest.raises(Rejection, match="name_taken"):
         send(store, signed, GOOD)
 
@@ -218,14 +218,14 @@ def test_a_season_with_a_list_takes_listed_keys_under_their_listed_names(store, 
     request = signed_request(store, online, key)
     assert refused(store, entries[0]) == "not_admitted"
     with pytest.raises(Rejection, match=r"not_admitted: .* the organiser of the season tickets"):
-        store.start_ticket(request)
+        store.add("ticket", request)
     store.admit("listed", SigningKey.generate().public, "Another")
     assert refused(store, entries[0]) == "not_admitted"
     assert store.admit("listed", key.public, "A Lab")
     assert send(store, entries[0])
     assert [row.entrant.submitter for row in store.entrants(offline.digest)] == ["A Lab"]
     with pytest.raises(Rejection, match="not_admitted"):  # each season has its own list
-        store.start_ticket(request)
+        store.add("ticket", request)
     store.reindex()
     assert store.admitted(offline.digest)[key.public] == "A Lab"
     assert verify(store.folder.path, board=SeasonStore).log_sequence == store.head.sequence

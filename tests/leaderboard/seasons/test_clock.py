@@ -6,10 +6,10 @@ import time
 import httpx
 import pytest
 
-from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.web import SeasonRoutes
-from leaderboard.store.blobs import to_bytes
+from leaderboard.store.log import to_bytes
 from tests.leaderboard.clocks import set_clocks
 from tests.leaderboard.conftest import put_submission, signed_withdrawal
 from tests.leaderboard.seasons.playing import online_board
@@ -126,7 +126,7 @@ def test_a_ticket_that_a_wrong_clock_has_ended_stays_ended_and_its_season_verifi
     board, key, monkeypatch
 ):
     with SeasonStore.open(board.path) as store:
-        store.start_ticket(signed_request(store, board.season, key))
+        store.add("ticket", signed_request(store, board.season, key))
     set_clocks(monkeypatch, forward=MONTH)
     with served(board):
         assert "ended" in events(board, 20, "ended")

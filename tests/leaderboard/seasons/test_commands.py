@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.publication import read_season
 from leaderboard.seasons.season import Master

@@ -10,7 +10,8 @@ from leaderboard.admission import upload_header
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
 from leaderboard.seasons.season import TicketRequest
-from leaderboard.seasons.store import SeasonStore, start_ticket
+from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.tickets import start_ticket
 from sme_registry import seasons
 from sme_registry.seasons import wire
 from tests.leaderboard.seasons.killing import step_through_kills
@@ -31,7 +32,7 @@ def board(tmp_path_factory):
             store.announce(tiny_season("sealed-online", id=name, **fields))
         store.announce(tiny_season("sealed-offline"))
         ada = {"name": "Ada", "key": OTHER.public}
-        store.start_ticket(board.request(OTHER, submitter=ada))
+        store.add("ticket", board.request(OTHER, submitter=ada))
     return board
 
 
@@ -103,7 +104,7 @@ def test_a_season_that_is_open_and_a_key_have_only_so_many_tickets(url, board, k
 def test_tickets_count_towards_the_quota_of_a_day(tmp_path, key):
     board = online_board(tmp_path, limits={"submissions_per_day": 1})
     with SeasonStore.open(board.path) as store:
-        store.start_ticket(board.request(key))
+        store.add("ticket", board.request(key))
         envelope = Signed[TicketRequest].read(board.request(key, 1).to_bytes())
         with pytest.raises(Rejection, match="quota"):
             start_ticket(store, envelope)
@@ -155,7 +156,7 @@ def test_the_ranking_grows_as_tickets_end(url, board, key):
     address = f"{url}/api/seasons/ranked/ranking"
     with SeasonStore.open(board.path) as store:
         store.announce(season)
-        store.start_ticket(ranked.request(key))
+        store.add("ticket", ranked.request(key))
         empty = httpx.get(address).json()
         store.finish(scored(store, season, 1))
     grown = httpx.get(address, params={"metric": "ood_regret"}).json()

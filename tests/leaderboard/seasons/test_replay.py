@@ -11,8 +11,7 @@ from leaderboard.seasons.publication import files_of_seasons
 from leaderboard.seasons.scoring import season_rankings
 from leaderboard.seasons.season import Reveal
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.store.blobs import digest_of
-from leaderboard.store.log import Clock
+from leaderboard.store.log import Clock, digest_of
 from leaderboard.web.client import fetch
 from sme_registry.seasons import wire
 from tests.leaderboard.clocks import AFTERWARDS, move_clock
@@ -240,7 +239,7 @@ def test_no_log_has_an_early_reveal_or_goes_back_in_time(tmp_path):
 def test_a_ticket_that_ended_early_without_all_answers_is_found(tmp_path, monkeypatch, key):
     board = online_board(tmp_path)
     with SeasonStore.open(board.path) as store:
-        store.start_ticket(signed_request(store, board.season, key))
+        store.add("ticket", signed_request(store, board.season, key))
         store.finish(scored(store, board.season, 1))
         logged(monkeypatch, AFTERWARDS, store, *reveal(board))
         with pytest.raises(TamperedError, match="without all answers: must not be before"):

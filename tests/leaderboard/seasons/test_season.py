@@ -13,8 +13,8 @@ import pytest
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.scoring.aggregation import run_metrics
-from leaderboard.seasons import store as admission
+from leaderboard.scoring.ranking import run_metrics
+from leaderboard.seasons import scoring
 from leaderboard.seasons.publication import (
     challenge_path,
     check_published,
@@ -24,6 +24,7 @@ from leaderboard.seasons.publication import (
     read_season,
     recipe,
     refuse_unfit,
+    verify_seasons,
 )
 from leaderboard.seasons.scoring import (
     by_key,
@@ -36,7 +37,6 @@ from leaderboard.seasons.scoring import (
 )
 from leaderboard.seasons.season import Master, Reveal, Season, Terms
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.verify import verify_seasons
 from sme_registry import materialize
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import SMEError
@@ -89,7 +89,7 @@ def enter(store, season, key, answers, **fields):
     ]
     signed = signed_entry(store, season, key, named, **fields)
     data = dict(zip(digests, files, strict=True))
-    assert admission.enter(store, signed, answers=lambda digest: data[digest] or b"")
+    assert scoring.enter(store, signed, answers=lambda digest: data[digest] or b"")
     return signed.id
 
 
@@ -201,7 +201,7 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, l
     last = enter(store, season, key, halves(published), method=method("Best"))
     # Kept back, and logged by an organiser's own board when a later one had arrived.
     old = {"method": method("Best"), "created": moment(-2)}
-    store.enter(signed_entry(store, season, key, [None, None], **old))
+    store.add("entry", signed_entry(store, season, key, [None, None], **old))
     enter(store, season, friend, halves(published), method=method("Fit"))
     family = enter(store, season, friend, best, method=method("Fit", "family"))
     failed = enter(store, season, friend, [None, None], method=method("Failed"))
@@ -388,7 +388,7 @@ def test_the_tickets_of_each_method_have_their_own_scores_and_rank(
         for number in range(4):
             name, who = ("Good", key) if number < 2 else ("Bad", other)
             request = signed_request(store, season, who, number, method=method(name))
-            store.start_ticket(request)
+            store.add("ticket", request)
             result = failed_result(season, request.id)
             if name == "Good":
                 runs = [run.model_copy(update={"wd_regret": 0.5}) for run in result.runs]

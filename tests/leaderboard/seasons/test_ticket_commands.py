@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.seasons import entrant

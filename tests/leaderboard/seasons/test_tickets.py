@@ -13,13 +13,12 @@ from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.worker import Work, run_scorer
 from leaderboard.seasons import tickets as tickets_module
-from leaderboard.seasons.events import played_bytes
 from leaderboard.seasons.instance import Instance
-from leaderboard.seasons.journal import Journal, Play
+from leaderboard.seasons.journal import Journal, Play, played_bytes
 from leaderboard.seasons.season import Master, TicketRequest
-from leaderboard.seasons.store import SeasonStore, start_ticket
-from leaderboard.seasons.tickets import ScoreTicket, Sessions, Ticket
-from leaderboard.store.blobs import to_bytes
+from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.tickets import ScoreTicket, Sessions, Ticket, start_ticket
+from leaderboard.store.log import to_bytes
 from sme_registry import materialize
 from sme_registry.seasons.wire import pack_table, unpack_table
 from tests.leaderboard.clocks import set_clocks
@@ -286,7 +285,7 @@ def test_a_lost_snapshot_is_replaced_by_a_replay(played, fault):
 def test_tickets_of_earlier_versions_are_scored_but_not_played_on(played):
     old = played.board.request(played.key, 1, answers_key=None, transcript=None)
     assert not {"answers_key", "transcript"} & old.to_dict()["ticket"].keys()
-    number, _ = played.store.start_ticket(old)
+    number, _ = played.store.add("ticket", old)
     refused("ticket_ended", played.sessions.ticket(number).instance(0).start, 1)
     result = scored(played.store, played.board.season, number)
     assert "signed" not in result.to_dict()["stepping"][0]
@@ -322,7 +321,7 @@ def test_a_deadline_ends_everything(tmp_path, monkeypatch, hours):
 
 def test_an_altered_request_holds_up_no_other_ticket(played, monkeypatch):
     second = played.board.request(played.key, 1)
-    played.store.start_ticket(second)
+    played.store.add("ticket", second)
     document = played.store.ticket(played.board.season.digest, 1).document
     played.store.folder.object(document).write_bytes(second.to_bytes())
     played.restart()

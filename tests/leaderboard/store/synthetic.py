@@ -1,7 +1,7 @@
 """Synthetic results, for tests of storage that need no scoring."""
 
 from leaderboard.documents.result import Result, RunScore
-from leaderboard.scoring.aggregation import result_of, run_metrics
+from leaderboard.scoring.ranking import result_of, run_metrics
 from leaderboard.scoring.score import evaluation_seed
 
 

@@ -23,7 +23,7 @@ def put(board, key):
     data = linear_onnx(1)
     with Store.open(board) as store:
         digest = sha256_of(data)
-        return store.put_object(digest, [data], by=key.public)
+        return store.put_object(digest, data, by=key.public)
 
 
 def receive(board, key):
@@ -50,7 +50,7 @@ def prepared(path, key, work):
         if work is receive:
             _, artefacts = tiny_submission(store, key, 0)
             for digest, data in artefacts.items():
-                store.put_object(digest, [data], by=key.public)
+                store.put_object(digest, data, by=key.public)
         elif work is not put:
             put_submission(store, key, 0)
 

@@ -4,9 +4,9 @@ import time
 import pytest
 
 from leaderboard import admission
-from leaderboard.errors import Rejection
+from leaderboard.errors import BoardError, Rejection
 from leaderboard.store import Store, collect_garbage
-from leaderboard.store.blobs import Objects
+from leaderboard.store.log import Objects
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_submission
 
@@ -15,7 +15,7 @@ HOUR, DAY = 3600.0, 86400.0
 
 def put(store, key, data):
     digest = sha256_of(data)
-    store.put_object(digest, [data], by=key.public)
+    store.put_object(digest, data, by=key.public)
     return digest
 
 
@@ -43,33 +43,34 @@ def test_garbage_is_temporary_files_and_unnamed_artefacts(store, litter):
     before = store.total_bytes()
     garbage = collect_garbage(store)
     assert (garbage.temporary, garbage.objects) == (3, 1)
-    assert garbage.files == 4
+    assert garbage.temporary + garbage.objects == 4
     assert garbage.bytes == 3 * len(b"half") + len(b"old and not submitted")
     assert not store.objects.has(old)
     assert store.objects.has(young)
     assert store.objects.has(named)
     assert [path.name for path in store.folder.path.rglob(".*.tmp")] == [".alive.12345678.tmp"]
     assert store.total_bytes() == before - len(b"old and not submitted")
-    assert collect_garbage(store).files == 0
+    assert collect_garbage(store)[:2] == (0, 0)
 
 
-def test_gc_keeps_an_upload_in_progress(store, key):
-    data = b"first half, second half"
-    digest = sha256_of(data)
+def test_an_upload_that_gc_removes_while_it_is_stored_is_refused(store, key, monkeypatch):
+    data, put = b"policy", store.objects.put
 
-    def slow():
-        yield data[:10]
-        assert collect_garbage(store, objects_older_than=0).files == 0
-        yield data[10:]
+    def put_then_collected(*arguments):
+        put(*arguments)
+        assert collect_garbage(store, objects_older_than=0).objects == 1
 
-    assert store.put_object(digest, slow(), by=key.public)
-    assert store.objects.read(digest) == data
+    with monkeypatch.context() as patch:
+        patch.setattr(store.objects, "put", put_then_collected)
+        with pytest.raises(BoardError, match="removed meanwhile"):
+            store.put_object(sha256_of(data), data, by=key.public)
+    assert store.put_object(sha256_of(data), data, by=key.public)
 
 
 def test_gc_between_check_and_log_entry_refuses_the_submission(store, key, monkeypatch):
     signed, artefacts = tiny_submission(store, key)
     for digest, data in artefacts.items():
-        store.put_object(digest, [data], by=key.public)
+        store.put_object(digest, data, by=key.public)
         age(store.folder.object(digest), DAY + 60)
     real = admission._check_files
 
@@ -85,13 +86,12 @@ def test_gc_between_check_and_log_entry_refuses_the_submission(store, key, monke
     assert refused.value.code == "artefact_missing"
     assert store.entries() == []
     for digest, data in artefacts.items():
-        assert store.put_object(digest, [data], by=key.public)
+        assert store.put_object(digest, data, by=key.public)
     assert admission.admit(store, signed)
     assert collect_garbage(store, objects_older_than=0).objects == 0
 
 
-def test_gc_takes_no_artefact_that_was_just_uploaded_again(store, key, monkeypatch):
-    """Another process collects while the upload finds an old artefact in place."""
+def test_an_old_artefact_that_gc_removes_may_be_uploaded_again(store, key, monkeypatch):
     data = b"old, and uploaded again"
     digest = put(store, key, data)
     age(store.folder.object(digest), DAY + 60)
@@ -104,6 +104,6 @@ def test_gc_takes_no_artefact_that_was_just_uploaded_again(store, key, monkeypat
 
     monkeypatch.setattr(Objects, "put", collect_then_put)
     assert put(store, key, data) == digest
-    assert collected == [0]
+    assert collected == [1]
     assert store.objects.read(digest) == data
     assert collect_garbage(store).objects == 0

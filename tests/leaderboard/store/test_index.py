@@ -111,7 +111,7 @@ def test_read_only_opening_writes_nothing(tmp_path, key):
     with Store.open(tmp_path / "board", read_only=True) as store:
         assert len(store.entries()) == 4
         for refused in (
-            lambda: store.put_object("sha256:" + "0" * 64, [b""], by=key.public),
+            lambda: store.put_object("sha256:" + "0" * 64, b"", by=key.public),
             lambda: put_submission(store, key, 9),
             lambda: store.queue.claim("worker"),
             store.reindex,

@@ -5,7 +5,7 @@ import numpy as np
 from leaderboard.documents.result import ClassScore, Estimate, Result, RunScore, Scores
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import Submission
-from leaderboard.scoring.aggregation import failed_run, levels_of, run_metrics
+from leaderboard.scoring.ranking import failed_run, levels_of, run_metrics
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.io import sha256_of
 from sme_registry.spec import EvaluationProtocol, Suite

@@ -23,9 +23,9 @@ from leaderboard.documents.submission import utc
 from leaderboard.errors import BoardError
 from leaderboard.gate import isolation
 from leaderboard.web import app
-from leaderboard.web.http import HTTP_CODES, STATUSES
-from leaderboard.web.server import serve
-from leaderboard.web.tables import PublicView
+from leaderboard.web.app import serve
+from leaderboard.web.client import PublicView
+from leaderboard.web.server import HTTP_CODES, STATUSES
 from sme_registry.errors import OptionError
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import (
@@ -433,7 +433,7 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path, key):
 
         scored = boards.submit(store, key, "PPO", [0.2] * 6)
         policy = b"PPO 1.0 plane1 0"  # whose digest the submission names
-        store.put_object(sha256_of(policy), [policy], by=key.public)
+        store.put_object(sha256_of(policy), policy, by=key.public)
         assert downloads(sha256_of(policy)) == {(200, ""), (200, policy.decode())}
         store.withdraw(signed_withdrawal(store, scored, key))
         assert downloads(sha256_of(policy)) == {(200, ""), (200, policy.decode())}

@@ -234,7 +234,7 @@ def test_a_server_in_the_middle_passes_on_no_submission(tmp_path, url, relay, st
     receiver = Receiver(store.document.key, relay)
     for digest in artefacts_of(signed):  # as if the board had them
         store.put_object(
-            digest, [(folder / "artefacts" / f"{hex_of(digest)}.onnx").read_bytes()], by=key.public
+            digest, (folder / "artefacts" / f"{hex_of(digest)}.onnx").read_bytes(), by=key.public
         )
     relayed = signed.content.signed(key, receiver)
     for each in (relayed, signed, relayed.model_copy(update={"address": url})):

@@ -44,7 +44,7 @@ def board(tmp_path_factory):
     """A board with a public artefact of 5 MiB, which its scored submission might have named."""
     with boards.create(tmp_path_factory.mktemp("served") / "board", classes=1) as store:
         id = boards.submit(store, SigningKey.generate(), "PPO", [0.2] * 6)
-        store.put_object(sha256_of(DATA), [DATA], by=SigningKey.generate().public)
+        store.put_object(sha256_of(DATA), DATA, by=SigningKey.generate().public)
         with store.transaction() as index:
             index.connection.execute("INSERT INTO artefact VALUES (?, ?)", (sha256_of(DATA), id))
         yield store

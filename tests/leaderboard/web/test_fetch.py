@@ -8,9 +8,8 @@ from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
-from leaderboard.seasons.publication import files_of_seasons
+from leaderboard.seasons.publication import files_of_seasons, verify_seasons
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.verify import verify_seasons
 from leaderboard.store import Store
 from leaderboard.web.client import ServedBoard, fetch
 from tests.leaderboard.conftest import EXAMPLE, SEASONS

@@ -20,8 +20,8 @@ from leaderboard.errors import NotPublishable
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Copies, Store
-from leaderboard.web import charts, tables
 from leaderboard.web import pages as site_pages
+from leaderboard.web import tables
 from leaderboard.web.pages import Pages, content_type
 from leaderboard.web.server import write_site
 from sme_registry.errors import OptionError
@@ -535,7 +535,7 @@ def test_explorers_are_written_on_request_and_linked(tmp_path, store, submit):
 def test_a_bar_spans_its_interval_and_marks_its_value():
     estimate = Estimate(value=0.5, low=0.25, high=1.0)
     bar = ElementTree.fromstring(
-        charts.Bars([estimate], {"optimal": 0.0, "constant": 1.0}).bar(estimate)
+        tables.Bars([estimate], {"optimal": 0.0, "constant": 1.0}).bar(estimate)
     )
     interval = bar.find("line[@class='ci']")
     assert (interval.get("x1"), interval.get("x2")) == ("26.50%", "97.00%")
@@ -546,7 +546,7 @@ def test_a_bar_spans_its_interval_and_marks_its_value():
 
 @given(st.lists(st.floats(-1e6, 1e6), max_size=5))
 def test_a_scale_covers_every_value_with_round_ends(values):
-    scale = charts.Scale.covering(*values)
+    scale = tables.Scale.covering(*values)
     assert scale.low < scale.high
     assert 2 <= len(scale.ticks) <= 8
     for value in values:

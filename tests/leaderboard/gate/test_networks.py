@@ -5,9 +5,8 @@ import onnx
 import onnxruntime
 import pytest
 
-from leaderboard.gate.reference import constant_onnx, optimal_onnx
+from leaderboard.gate.networks import can_show, constant_onnx, explorer, network_of, optimal_onnx
 from leaderboard.gate.sandbox import inspect_own, widths
-from leaderboard.web.explorers import can_show, explorer, network_of
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.export import onnx_bytes
 from tests.explorer.networks import offline, perceptron
