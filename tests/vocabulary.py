@@ -26,6 +26,7 @@ QUANTITIES = {
     "similarity_loss": "100 (r̃_WD − r̃_m), points",
     # Critics against exact values
     "ranking": "share of pairs of actions that a critic orders as the step reward does",
+    "critic_ranking": "the same of the critic at the end of a visit, on the task of its phase",
     "misled_ranking": "the same against what shaping leaves to a learner of this γ",
     "claim": "mean of what a critic says",
     "finite": "mean exact discounted value to the end of the episode",

@@ -33,7 +33,7 @@ from sme_registry.datasets.documents import BCHyperparameters, Hyperparameters, 
 from sme_registry.datasets.storage import SealedDataset
 from sme_registry.datasets.transitions import Transitions
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation.networks import OfflineLayer
+from sme_registry.evaluation.networks import OfflineCritic, OfflineLayer
 from sme_registry.task import draw
 
 CRITICS = 2
@@ -209,6 +209,15 @@ class OfflineLearner:
     @property
     def layers(self) -> list[OfflineLayer]:
         return weights(self._networks.actor)
+
+    @property
+    def critics(self) -> list[OfflineCritic]:
+        """Those of IQL; BC has none."""
+        if isinstance(self.hyperparameters, BCHyperparameters):
+            return []
+        about = {**self.about, "discount": self.hyperparameters.discount}
+        networks: Any = self._networks
+        return [OfflineCritic(weights(critic), about) for critic in networks.critics]
 
     def advance(self, until: int, report: Callable[[int], None]) -> None:
         """Learn up to a step; `report` is called with the steps done every 50 of them."""

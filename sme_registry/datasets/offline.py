@@ -3,6 +3,7 @@
 The folder of an offline training:
     offline.json      the record, with all evaluations
     policy.npz        the policy, for `OfflinePolicy.load` and `sme evaluate`
+    critic-0.npz, critic-1.npz     of IQL, for `sme_registry.diagnosis.critic`
     evaluation.json   its final evaluation; decay_curve.png, .pdf if matplotlib is installed
 
 Importing this module does not import PyTorch.
@@ -49,7 +50,8 @@ if TYPE_CHECKING:
     from sme_registry.datasets.learners import OfflineLearner
 
 RECORD, POLICY, EVALUATION = "offline.json", "policy.npz", "evaluation.json"
-_FILES = (RECORD, POLICY, EVALUATION, *plot_files.FILES)
+CRITICS = "critic-0.npz", "critic-1.npz"
+_FILES = (RECORD, POLICY, *CRITICS, EVALUATION, *plot_files.FILES)
 _PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
 
 _CHECKED_ROWS = 64
@@ -170,6 +172,10 @@ def train_offline(
     if target is not None:
         (target / RECORD).unlink(missing_ok=True)
         policy.save(target / POLICY)
+        for name in CRITICS:  # of an earlier training
+            (target / name).unlink(missing_ok=True)
+        for name, critic in zip(CRITICS, learner.critics, strict=False):
+            critic.save(target / name)
         evaluated.write(target / EVALUATION)
         if is_installed("matplotlib"):
             plot_files.write_evaluation(evaluated, target)

@@ -86,12 +86,14 @@ def _badly(ranking: float) -> bool:
 @_about(
     yes="level_immature",
     no="level_right",
-    unclear="level_biased",
+    unclear="level_biased level_of_data",
     thresholds="level_bias maturity",
 )
 def _critic_level(run: TaskDiagnosis) -> Decision:
     report = _critic_of(run)
     cube = report.region("WD")
+    if cube.bias_share is None:
+        return Decision("level_of_data", {})
     evidence = {
         **cube.model_dump(include={"claim", "finite", "continuing", "bias_share"}),
         "sweeps": report.sweeps,

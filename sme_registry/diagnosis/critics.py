@@ -5,6 +5,7 @@ Source: METHOD, section 11. A critic is compared with the policy that its target
     PPO          V of the clipped Gaussian
     SAC          min Q of the policy's mode, then its samples, with −α log π added at every step
     TD3, DDPG    min Q of the actor, then the actor with its target noise
+    IQL          min Q, of its ranking alone: its targets assume no policy that could be played
 """
 
 from __future__ import annotations
@@ -15,11 +16,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from sme_registry.datasets.offline import CRITICS, POLICY
 from sme_registry.envs.arguments import single_agent
 from sme_registry.envs.batch import Batch
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.models import evaluating, load_sb3
+from sme_registry.evaluation.networks import OfflineCritic, OfflinePolicy
 from sme_registry.evaluation.rollouts import play
 from sme_registry.evaluation.values import expected_returns, value_after_end
 from sme_registry.io import integer_in
@@ -45,7 +48,7 @@ class CriticRegion(StrictModel):
         as the step reward does: ½ is chance, 1 perfect. Null for V, and where no two differ.
       misled_ranking: the same against the reward that shaping leaves to a learner of this γ; null
         without shaping, too.
-      claim: mean of what the critic says.
+      claim: mean of what the critic says. Null of IQL, as all that follows.
       finite: mean exact value to the end of the episode.
       continuing: mean exact value of going on after it, which an agent that bootstraps at a
         truncation estimates; null at γ = 1.
@@ -57,11 +60,11 @@ class CriticRegion(StrictModel):
     states: Integer
     ranking: Real | None
     misled_ranking: Real | None
-    claim: Real
-    finite: Real
+    claim: Real | None
+    finite: Real | None
     continuing: Real | None
-    bias: Real
-    bias_share: Real
+    bias: Real | None
+    bias_share: Real | None
 
 
 class CriticTime(StrictModel):
@@ -78,9 +81,9 @@ class CriticReport(StrictModel):
 
     Attributes:
       kind: "V" of states, "Q" of states and actions.
-      sweeps: τ times the updates of the targets. Null of V.
+      sweeps: τ times the updates of the targets. Null of V, and of IQL.
       regions: visited states, the cube, and five shells.
-      times: levels over t/T.
+      times: levels over t/T; none of IQL.
     """
 
     algorithm: str
@@ -112,6 +115,38 @@ class _Points(NamedTuple):
         return cls(s, t, r_cum, d, batch.observe())
 
 
+class OfflineAgent:
+    """What IQL's critics claim of actions of [0, 1], and its policy."""
+
+    name = "IQL"
+    kind: Literal["Q"] = "Q"
+    sweeps = None
+
+    def __init__(self, folder: Path) -> None:
+        self.mode = OfflinePolicy.load(folder / POLICY)
+        self._critics = [OfflineCritic.load(folder / name) for name in CRITICS]
+        self.gamma = float(self._critics[0].about["discount"])
+        self.observation_shape = (self.mode.observation_dim,)
+
+    @classmethod
+    def of(cls, model: Any) -> OfflineAgent | None:
+        """The agent in the folder of an offline training, or of its policy; or None."""
+        if isinstance(model, cls):
+            return model
+        if not isinstance(model, str | Path):
+            return None
+        folder = Path(model).parent if str(model).endswith(".npz") else Path(model)
+        return cls(folder) if (folder / CRITICS[0]).exists() else None
+
+    def __call__(self, observations: Observation) -> Array:
+        return np.asarray(self.mode(observations), np.float64)
+
+    def claim(self, observations: Observation, actions: Array) -> Array:
+        inputs = np.concatenate([observations, 2.0 * actions - 1.0], axis=1, dtype=np.float32)
+        claims = [critic(inputs)[:, 0] for critic in self._critics]
+        return np.asarray(np.min(claims, axis=0), np.float64)
+
+
 class _Critic:
     """What an SB3 model claims, and the policy whose value that is; actions are of [0, 1]."""
 
@@ -119,6 +154,7 @@ class _Critic:
         import torch
 
         self._torch, self._network = torch, model.policy
+        self.observation_shape = model.observation_space.shape
         self._generator = torch.Generator().manual_seed(seed)
         self.name = type(model).__name__
         self.gamma = float(model.gamma)
@@ -204,7 +240,8 @@ def critic(
 
     Args:
       model: PPO, TD3, SAC or DDPG, as a model or the path of its .zip (which can run code of its
-        author), as `sme train` writes it for agents in JAX too.
+        author), as `sme train` writes it for agents in JAX too; or the folder of an offline
+        training with IQL, of which only the ranking is known.
       kind: "V" or "Q", to be sure of it; by default what the model has.
       states: of each region.
       seed: of states, of noise and of sampled actions.
@@ -218,15 +255,15 @@ def critic(
     task = single_agent(task if isinstance(task, Task) else load_task(task))
     integer_in("states", states, 1)
     learnt = _critic_of(model, task, kind, seed)
-    tail = None
-    if learnt.gamma < 1:
-        tail = value_after_end(task, learnt, learnt.gamma, seed)
     protocol = EvaluationProtocol(states_per_region=states, seed=seed)
     points = {VISITED: _visited(task, learnt, states, seed)} | {
         regions.region_name(region): _drawn(task, protocol, region)
         for region in range(len(protocol.epsilons) + 1)
     }
-    levels = {name: _Levels.of(task, learnt, at, tail, seed) for name, at in points.items()}
+    levels: dict[str, _Levels] = {}
+    if isinstance(learnt, _Critic):
+        tail = value_after_end(task, learnt, learnt.gamma, seed) if learnt.gamma < 1 else None
+        levels = {name: _Levels.of(task, learnt, at, tail, seed) for name, at in points.items()}
     return CriticReport(
         algorithm=learnt.name,
         kind=learnt.kind,
@@ -235,15 +272,29 @@ def critic(
         sweeps=learnt.sweeps,
         seed=seed,
         regions=tuple(
-            _region(task, learnt, name, at, levels[name], seed) for name, at in points.items()
+            _region(task, learnt, name, at, levels.get(name), seed) for name, at in points.items()
         ),
-        times=tuple(_times(task, points["WD"], levels["WD"])),
+        times=tuple(_times(task, points["WD"], levels["WD"])) if levels else (),
     )
+
+
+def ranking_in_cube(model: Any, task: Task, states: int, seed: int) -> float | None:
+    """The ranking of a model's critic in the cube alone; None where `critic` has none."""
+    if not has_critic(model, task):
+        return None
+    learnt = _critic_of(model, task, None, seed)
+    if learnt.kind == "V":
+        return None
+    protocol = EvaluationProtocol(states_per_region=states, seed=seed)
+    return _rankings(task, learnt, _drawn(task, protocol, 0), seed)[0]
 
 
 def has_critic(model: Any, task: Task) -> bool:
     """Whether `critic` can compare the critic of a model on this task."""
-    return _is_read(model) and model.observation_space.shape == (task.spec.observation_dim,)
+    expected = (task.spec.observation_dim,)
+    if isinstance(model, OfflineAgent):
+        return model.observation_shape == expected
+    return _is_read(model) and model.observation_space.shape == expected
 
 
 def _is_read(model: Any) -> bool:
@@ -254,20 +305,23 @@ def _is_read(model: Any) -> bool:
     return any(hasattr(model.policy, critic) for critic in ("predict_values", "critic"))
 
 
-def _critic_of(model: Any, task: Task, kind: str | None, seed: int) -> _Critic:
-    learnt = load_sb3(model) if isinstance(model, str | Path) else model
-    if not _is_read(learnt):
-        raise PolicyError(
-            f"model: {type(learnt).__name__} has no critic that is known here. Give a PPO, A2C, "
-            "TD3, SAC or DDPG of Stable-Baselines3, or its .zip."
-        )
-    seen, expected = learnt.observation_space.shape, (task.spec.observation_dim,)
+def _critic_of(model: Any, task: Task, kind: str | None, seed: int) -> _Critic | OfflineAgent:
+    found: _Critic | OfflineAgent | None = OfflineAgent.of(model)
+    if found is None:
+        learnt = load_sb3(model) if isinstance(model, str | Path) else model
+        if not _is_read(learnt):
+            raise PolicyError(
+                f"model: {type(learnt).__name__} has no critic that is known here. Give a PPO, "
+                "A2C, TD3, SAC or DDPG of Stable-Baselines3, or its .zip; or the folder of an "
+                "offline training with IQL."
+            )
+        found = _Critic(learnt, seed)
+    seen, expected = found.observation_shape, (task.spec.observation_dim,)
     if seen != expected:
         raise PolicyError(
             f"model: its observations have shape {seen}, and this task's {expected}. Give the task "
             "that it was trained on; of a stream with an observed phase, critics are not compared."
         )
-    found = _Critic(learnt, seed)
     if kind not in (None, found.kind):
         raise PolicyError(
             f"kind={kind!r}: {found.name} has a critic of {found.kind}, not of {kind}. Leave kind "
@@ -287,7 +341,7 @@ def _drawn(task: Task, protocol: EvaluationProtocol, region: int) -> _Points:
     return _Points.of(task, np.asarray(batch.s, np.float64), t, np.zeros(len(t)), batch.d)
 
 
-def _visited(task: Task, learnt: _Critic, states: int, seed: int) -> _Points:
+def _visited(task: Task, learnt: _Critic | OfflineAgent, states: int, seed: int) -> _Points:
     """States that the policy visits, at random times of its episodes."""
     spec = task.spec
     batch = Batch(task, max(16, -(-2 * states // spec.horizon)))
@@ -328,21 +382,34 @@ class _Levels(NamedTuple):
 
 
 def _region(
-    task: Task, learnt: _Critic, name: str, at: _Points, levels: _Levels, seed: int
+    task: Task,
+    learnt: _Critic | OfflineAgent,
+    name: str,
+    at: _Points,
+    levels: _Levels | None,
+    seed: int,
 ) -> CriticRegion:
-    bias = float((levels.claim - levels.estimated).mean())
     ranking, misled = _rankings(task, learnt, at, seed) if learnt.kind == "Q" else (None, None)
     return CriticRegion(
         region=name,
         states=len(at.s),
         ranking=ranking,
         misled_ranking=misled,
-        claim=float(levels.claim.mean()),
-        finite=float(levels.finite.mean()),
-        continuing=None if levels.continuing is None else float(levels.continuing.mean()),
-        bias=bias,
-        bias_share=bias / max(abs(float(levels.estimated.mean())), 1e-9),
+        **_means(levels),
     )
+
+
+def _means(levels: _Levels | None) -> dict[str, float | None]:
+    if levels is None:
+        return dict.fromkeys(("claim", "finite", "continuing", "bias", "bias_share"))
+    bias = float((levels.claim - levels.estimated).mean())
+    return {
+        "claim": float(levels.claim.mean()),
+        "finite": float(levels.finite.mean()),
+        "continuing": None if levels.continuing is None else float(levels.continuing.mean()),
+        "bias": bias,
+        "bias_share": bias / max(abs(float(levels.estimated.mean())), 1e-9),
+    }
 
 
 def _times(task: Task, at: _Points, levels: _Levels) -> list[CriticTime]:
@@ -361,7 +428,7 @@ def _times(task: Task, at: _Points, levels: _Levels) -> list[CriticTime]:
 
 
 def _rankings(
-    task: Task, learnt: _Critic, at: _Points, seed: int
+    task: Task, learnt: _Critic | OfflineAgent, at: _Points, seed: int
 ) -> tuple[float | None, float | None]:
     """Shares of pairs that the critic orders as the step reward, and as what misleads it."""
     spec, gamma = task.spec, learnt.gamma

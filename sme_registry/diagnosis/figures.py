@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from sme_registry.diagnosis.critics import CriticReport
 from sme_registry.diagnosis.document import Diagnosis, TaskDiagnosis
 from sme_registry.diagnosis.measure import LINEAR, POLICY
 from sme_registry.diagnosis.stream import StreamDiagnosis
@@ -252,32 +253,39 @@ def _which_phases(diagnosis: StreamDiagnosis, figure: Figure) -> None:
 
 
 def _critic(diagnosis: TaskDiagnosis, figure: Figure) -> None:
-    """Nothing without a critic; only its level where it values states."""
+    """Nothing without a critic; only its level where it values states, and its ranking for IQL."""
     report = diagnosis.measurements.critic
     if report is None:
         return
     ranked = [region for region in report.regions if region.ranking is not None]
-    *left, right = figure.subplots(1, 2 if ranked else 1, squeeze=False)[0]
-    for axes in left:
-        series = {"as their step rewards": [region.ranking for region in ranked]}
-        if ranked[0].misled_ranking is not None:
-            name = f"as paid at γ = {report.gamma:g}"
-            series[name] = [region.misled_ranking for region in ranked]
-        _lines(axes, range(len(ranked)), series)
-        axes.axhline(0.5, color=GREY, linewidth=1.1, label="chance")
-        axes.set_xticks(range(len(ranked)), [region.region for region in ranked], rotation=45)
-        axes.set(ylabel="pairs of actions that the critic\norders so, share", ylim=(0.0, 1.0))
+    draw = [_draw_ranking] * bool(ranked) + [_draw_levels] * bool(report.times)
+    if not draw:
+        return
+    panels = figure.subplots(1, len(draw), squeeze=False)[0]
+    for axes, drawn in zip(panels, draw, strict=True):
+        drawn(axes, report)
+    _legends(*panels)
+
+
+def _draw_ranking(axes: Axes, report: CriticReport) -> None:
+    ranked = [region for region in report.regions if region.ranking is not None]
+    series = {"as their step rewards": [region.ranking for region in ranked]}
+    if ranked[0].misled_ranking is not None:
+        name = f"as paid at γ = {report.gamma:g}"
+        series[name] = [region.misled_ranking for region in ranked]
+    _lines(axes, range(len(ranked)), series)
+    axes.axhline(0.5, color=GREY, linewidth=1.1, label="chance")
+    axes.set_xticks(range(len(ranked)), [region.region for region in ranked], rotation=45)
+    axes.set(ylabel="pairs of actions that the critic\norders so, share", ylim=(0.0, 1.0))
+
+
+def _draw_levels(axes: Axes, report: CriticReport) -> None:
     levels = {"the critic says": "claim", "to the end of the episode": "finite"}
     if report.regions[0].continuing is not None:
         levels["if it went on"] = "continuing"
-    time = [part.time for part in report.times]
-    _lines(
-        right,
-        time,
-        {name: [getattr(part, of) for part in report.times] for name, of in levels.items()},
-    )
-    right.set(xlabel="t/T", ylabel="discounted value")
-    _legends(*left, right)
+    series = {name: [getattr(part, of) for part in report.times] for name, of in levels.items()}
+    _lines(axes, [part.time for part in report.times], series)
+    axes.set(xlabel="t/T", ylabel="discounted value")
 
 
 def _draw_fresh(axes: Axes, values: Sequence[float | None]) -> None:
@@ -303,7 +311,15 @@ def _network_by_visit(diagnosis: StreamDiagnosis, figure: Figure) -> None:
         networks.insert(0, diagnosis.initial_network)
     alone = [diagnosis.phases[visit.phase].fresh_network for visit in diagnosis.visits]
     x = np.arange(len(networks)) - initial
-    panels = figure.subplots(1, len(quantities))
+    rankings = [visit.critic_ranking for visit in diagnosis.visits]
+    ranked = any(ranking is not None for ranking in rankings)
+    panels = figure.subplots(1, len(quantities) + ranked).tolist()
+    if ranked:
+        last = panels.pop()
+        _lines(last, [visit.visit for visit in diagnosis.visits], {"this life": rankings})
+        last.axhline(0.5, color=GREY, linewidth=1.1)  # chance
+        tick_visits(last, cast(Any, diagnosis.visits))
+        last.set(ylabel="ranking by the critic, share", ylim=(0.0, 1.0))
     for axes, (quantity, name) in zip(panels, quantities.items(), strict=True):
         life, fresh = ([getattr(n, quantity, None) for n in group] for group in (networks, alone))
         _lines(axes, x, {"this life": life})

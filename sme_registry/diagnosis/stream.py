@@ -10,19 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from sme_registry.diagnosis import measure
 from sme_registry.diagnosis.behaviour import NetworkState, network_state
+from sme_registry.diagnosis.critics import ranking_in_cube
 from sme_registry.diagnosis.document import Diagnosis, Part, cells, table
 from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Questions, add_to
 from sme_registry.diagnosis.subject import StreamSubject
 from sme_registry.evaluation import regions
+from sme_registry.evaluation.models import load_sb3
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.spec import StreamSpec
 from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
+from sme_registry.task.loading import load_task
 from sme_registry.task.task import Observation
 
 PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
@@ -37,6 +41,8 @@ class VisitDiagnosis(StrictModel):
     online_regret: Real | None  # its mean; None without a log, and where no step was counted
     normalised_regret: Real  # at its end, on its own phase
     network: NetworkState | None  # at its end; None if unknown
+    # share of pairs of actions that the critic at its end orders as the phase rewards them
+    critic_ranking: Real | None = None
 
 
 class PhaseDiagnosis(StrictModel):
@@ -88,12 +94,17 @@ class StreamDiagnosis(Diagnosis):
         """What a visit cost, what was known and the network at its end; what became of phases."""
         fields = "phase online_regret normalised_regret"
         visits = [
-            (str(visit.visit), *cells(visit, fields), *cells(visit.network, _NETWORK))
+            (
+                str(visit.visit),
+                *cells(visit, fields),
+                *cells(visit.network, _NETWORK),
+                *cells(visit, "critic_ranking"),
+            )
             for visit in self.visits
         ]
         if self.initial_network is not None:
-            visits.insert(0, ("initial", "", "", "", *cells(self.initial_network, _NETWORK)))
-        columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights")
+            visits.insert(0, ("initial", "", "", "", *cells(self.initial_network, _NETWORK), ""))
+        columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights", "critic")
         yield Part("Visits", columns, visits)
         rows = {str(phase.phase): phase for phase in self.phases}
         fields = (
@@ -107,7 +118,8 @@ _NETWORK = "inactive_units effective_rank weight_norm"
 _LEGEND = (
     "N: normalised regret at the end of the visit on its own phase, or of the life on each phase · "
     "online regret: mean of 1 − r over the visit · inactive: hidden units that are dormant or "
-    "saturated · rank: effective rank of the last hidden layer",
+    "saturated · rank: effective rank of the last hidden layer · critic: share of pairs of actions "
+    "that it orders as the phase rewards them, ½ is chance",
     "Dormant units, effective rank and weights go together with lost plasticity in the literature; "
     "none of them proves it. A study gives intervals over seeds.",
 )
@@ -341,6 +353,7 @@ def _weight_growth(life: StreamDiagnosis) -> Decision:
 
 
 _MOST_STATES = 2048  # in which networks are measured; more would not change the numbers
+_RANKED_STATES = 500  # in which a critic's actions are ranked
 
 
 def diagnose_stream(
@@ -349,7 +362,7 @@ def diagnose_stream(
     """The arguments and errors are those of `diagnose`."""
     life = subject.report
     agent, regret = life.region("WD").agent, life.dynamic_regret
-    report(f"{subject.name}: networks")
+    report(f"{subject.name}: networks and critics")
     spec = life.stream.phases[0].spec
     drawn = measure.states_of(spec, min(states, _MOST_STATES, regions.batch_rows(spec)), seed)
     observation = drawn.observation(drawn.s, spec.horizon)
@@ -358,7 +371,7 @@ def diagnose_stream(
         average_performance=agent.average_performance[-1],
         forgetting=agent.forgetting[-1],
         dynamic_regret=None if regret is None else regret.dynamic_regret,
-        visits=tuple(_visits(subject, observation)),
+        visits=tuple(_visits(subject, observation, min(states, _RANKED_STATES), seed)),
         phases=tuple(_phases(subject, observation)),
         initial_network=_state(subject.initial_network, observation, life.stream, 0),
     )
@@ -378,13 +391,26 @@ def _state(
     return network_state(network, observation)
 
 
-def _visits(subject: StreamSubject, observation: Observation) -> Iterator[VisitDiagnosis]:
+def _ranking(
+    model: Path | None, stream: StreamSpec, phase: int, states: int, seed: int
+) -> float | None:
+    """Of the critic of a model that was kept, on the task of a phase."""
+    if model is None or not model.exists():
+        return None
+    task = load_task(stream.phases[phase].spec)
+    return ranking_in_cube(load_sb3(model), task, states, seed)
+
+
+def _visits(
+    subject: StreamSubject, observation: Observation, ranked: int, seed: int
+) -> Iterator[VisitDiagnosis]:
     life, regret = subject.report, subject.report.dynamic_regret
     regret_on = life.region("WD").agent.normalised_regret
     logged = {} if regret is None else {visit.visit: visit for visit in regret.visits}
-    networks = subject.networks or (None,) * len(life.visits)
+    unknown = (None,) * len(life.visits)
+    kept = subject.networks or unknown, subject.models or unknown
     begin = 0
-    for visit, network in zip(life.visits, networks, strict=True):
+    for visit, network, model in zip(life.visits, *kept, strict=True):
         log = logged.get(visit.visit)
         yield VisitDiagnosis(
             visit=visit.visit,
@@ -395,6 +421,7 @@ def _visits(subject: StreamSubject, observation: Observation) -> Iterator[VisitD
             online_regret=None if log is None else log.online_regret,
             normalised_regret=regret_on[visit.visit][visit.phase],
             network=_state(network, observation, life.stream, visit.phase),
+            critic_ranking=_ranking(model, life.stream, visit.phase, ranked, seed),
         )
         begin = visit.lifetime
 

@@ -14,7 +14,10 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 from pydantic import JsonValue
 
+from sme_registry.datasets import offline
+from sme_registry.datasets.documents import OfflineRecord
 from sme_registry.diagnosis.behaviour import Log, exploration
+from sme_registry.diagnosis.critics import OfflineAgent
 from sme_registry.errors import OptionError, SMEError, SpecError, UnknownNameError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport
 from sme_registry.evaluation.models import load_sb3
@@ -47,7 +50,7 @@ class Subject:
     explore: Callable[[Observation], Any] | None = None  # the algorithm's stochastic actions
     checkpoint_step: int | None = None  # of an unfinished run, the steps at its checkpoint
     updates: int | None = None  # of the algorithm; None if unknown
-    model: Any = None  # of Stable-Baselines3, which may have a critic
+    model: Any = None  # of Stable-Baselines3, or an OfflineAgent, which may have a critic
 
     @property
     def document(self) -> SMESpec:
@@ -70,6 +73,7 @@ class StreamSubject:
     initial_network: Perceptron | None = None  # before training
     fresh_networks: Networks | None = None  # of the fresh agent of each phase
     updates: int | None = None
+    models: tuple[Path, ...] = ()  # kept at the end of each visit
     checkpoint_step: ClassVar[None] = None  # it has ended
 
     @property
@@ -125,6 +129,8 @@ def load_run(folder: str | Path) -> AnySubject:
     folder = Path(folder)
     if not folder.is_dir():
         raise OptionError(f"run={str(folder)!r}: no such folder. Give a folder of `sme train`.")
+    if (folder / offline.RECORD).exists():
+        return _offline_run(folder)
     record = RunRecord.read(folder)
     if record is None:
         advice = "Give a folder of `sme train`."
@@ -138,7 +144,8 @@ def load_run(folder: str | Path) -> AnySubject:
     if record.stream is not None:
         kept = run_files.Snapshots(folder / run_files.SNAPSHOTS, record.stream)
         networks = _networks(kept, record.stream, record.action_range)
-        return StreamSubject(name, _report_of_life(folder), plan, *networks, None, updates)
+        report, models = _report_of_life(folder), tuple(kept.visits)
+        return StreamSubject(name, report, plan, *networks, None, updates, models)
     path, checkpoint_step = _model_of_run(folder, record)
     log = folder / run_files.EPISODES
     return _subject(
@@ -151,6 +158,14 @@ def load_run(folder: str | Path) -> AnySubject:
         checkpoint_step=checkpoint_step,
         updates=updates,
     )
+
+
+def _offline_run(folder: Path) -> Subject:
+    record = OfflineRecord.read(folder / offline.RECORD)
+    plan = record.to_dict()
+    plan = {field: plan[field] for field in ("algorithm", "hyperparameters", "seed", "steps")}
+    name = folder.name or str(folder)
+    return _subject(name, str(folder / offline.POLICY), record.spec, "unit", plan=plan)
 
 
 def load_cell(study: str | Path, key: str) -> AnySubject:
@@ -181,7 +196,8 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
             )
             for alone in cell.fresh
         )
-        return StreamSubject(name, report, plan, visits, initial, fresh, updates)
+        models = tuple(kept.visits)
+        return StreamSubject(name, report, plan, visits, initial, fresh, updates, models)
     return _subject(
         name,
         _model_of_cell(study, path.stem, cell),
@@ -224,7 +240,7 @@ def _subject(
         team = as_policy(model, spec, action_range=action_range)
         return Subject(name or team.name, spec, team, **known)
     policy = numpy_policy(model, spec, action_range=action_range)
-    explore = exploration(model, policy)
+    explore, model = exploration(model, policy), OfflineAgent.of(model) or model
     return Subject(name or policy.name, spec, policy, explore=explore, model=model, **known)
 
 

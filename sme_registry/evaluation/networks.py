@@ -2,6 +2,7 @@
 
     Perceptron       x ← f(x W + b)  for each layer
     OfflinePolicy    h_0 = o,  h_i = max(0, W_i h_{i−1} + b_i),  a = (1 + tanh(W_n h_{n−1} + b_n))/2
+    OfflineCritic    h_0 = (o, 2a − 1), likewise,                Q = W_n h_{n−1} + b_n
 
 An .npz file holds `W0`, `b0`, `W1`, … in order, and `about`, a JSON text. Reading it runs no code.
 """
@@ -15,7 +16,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +29,6 @@ Weights = npt.NDArray[np.float32]
 Layer = tuple[Weights, Weights, str]
 OfflineLayer = tuple[Weights, Weights]
 
-KIND = "sme-offline-policy"
 _MAX_LAYERS = 64
 _MAX_BYTES = 2**28
 
@@ -150,17 +150,22 @@ class OfflinePolicy(Perceptron):
       [[0.5, 0.5, 0.5, 0.5]]
     """
 
+    kind: ClassVar[str] = "sme-offline-policy"
+    _output: ClassVar[str] = "tanh"
+
     def __init__(
         self, layers: Sequence[OfflineLayer], about: Mapping[str, Any] = MappingProxyType({})
     ) -> None:
         for array in itertools.chain(*layers):
             array.setflags(write=False)
-        activations = [*["relu"] * (len(layers) - 1), "tanh"]
+        activations = [*["relu"] * (len(layers) - 1), self._output]
         # Transposed views: copies would multiply in another order.
         self.layers = [(W.T, b, f) for (W, b), f in zip(layers, activations, strict=True)]
-        self.low = np.zeros(self.action_dim, np.float32)
-        self.high = np.ones(self.action_dim, np.float32)
+        self.low, self.high = self._bounds()
         self.about = about
+
+    def _bounds(self) -> tuple[Weights, Weights] | tuple[None, None]:
+        return np.zeros(self.action_dim, np.float32), np.ones(self.action_dim, np.float32)
 
     @property
     def __name__(self) -> str:
@@ -173,13 +178,13 @@ class OfflinePolicy(Perceptron):
         arrays: dict[str, Any] = {}
         for index, (W, b, _) in enumerate(self.layers):
             arrays |= {f"W{index}": W.T, f"b{index}": b}
-        about = np.frombuffer(to_json({"kind": KIND, **self.about}).encode(), dtype=np.uint8)
+        about = np.frombuffer(to_json({"kind": self.kind, **self.about}).encode(), dtype=np.uint8)
         content = io.BytesIO()
         np.savez(content, about=about, **arrays)
         return write_atomically(path, content.getvalue())
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> OfflinePolicy:
+    def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file that `save` wrote."""
         try:
             return cls._read(path)
@@ -193,7 +198,7 @@ class OfflinePolicy(Perceptron):
             ) from None
 
     @classmethod
-    def _read(cls, path: str | os.PathLike[str]) -> OfflinePolicy:
+    def _read(cls, path: str | os.PathLike[str]) -> Self:
         with zipfile.ZipFile(path) as members:
             unpacked = sum(member.file_size for member in members.infolist())
         if max(unpacked, os.path.getsize(path)) > _MAX_BYTES:
@@ -202,7 +207,7 @@ class OfflinePolicy(Perceptron):
             about = parse_json(stored["about"].tobytes())
             count = sum(name.startswith("W") for name in stored.files)
             layers = [(stored[f"W{i}"], stored[f"b{i}"]) for i in range(count)]
-        if not isinstance(about, dict) or about.pop("kind", None) != KIND:
+        if not isinstance(about, dict) or about.pop("kind", None) != cls.kind:
             raise PolicyError("its `about` does not name its kind.")
         if not 1 <= count <= _MAX_LAYERS:
             raise PolicyError(f"it has {count} layers.")
@@ -213,3 +218,16 @@ class OfflinePolicy(Perceptron):
             _check_layer(f"layer {index}, transposed", W.T, b, width)
             width = len(b)
         return cls(layers, about)
+
+
+class OfflineCritic(OfflinePolicy):
+    """A critic that IQL learnt beside a policy: from (o, 2a − 1), `[B, O + A]`, to Q `[B, 1]`.
+
+    `about` also has the "discount" of its targets.
+    """
+
+    kind = "sme-offline-critic"
+    _output = "identity"
+
+    def _bounds(self) -> tuple[None, None]:
+        return None, None

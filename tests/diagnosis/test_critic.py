@@ -12,10 +12,14 @@ pytest.importorskip("stable_baselines3")
 import torch
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
-from sme_registry.diagnosis import critic, diagnose, load_policy
+from sme_registry.datasets import train_offline
+from sme_registry.datasets.documents import BCHyperparameters, IQLHyperparameters
+from sme_registry.datasets.learners import OfflineLearner
+from sme_registry.diagnosis import critic, diagnose, load_policy, load_run
 from sme_registry.diagnosis.critics import CriticRegion, CriticReport, CriticTime
 from sme_registry.diagnosis.figures import draw
 from sme_registry.diagnosis.task import diagnosed
+from tests.datasets.sets import transitions_of
 from tests.diagnosis.policies import DEEP, SPEC, diagnosis_of
 
 SMALL = {"horizon": 20, "state_dim": 3, "action_dim": 2}
@@ -191,3 +195,60 @@ def test_a_diagnosis_of_a_model_has_its_critic_and_draws_it(laid_out, tmp_path):
     labels = [axes.get_ylabel() for figure in laid_out for axes in figure.axes]
     assert "discounted value" in labels
     assert "critic" not in diagnosis_of("linear", DEEP).model_dump()["measurements"]
+
+
+@pytest.fixture(scope="module")
+def iql(tmp_path_factory):
+    """The folder of a short training with IQL, which has learnt something, and its task."""
+    spec, folder = SMESpec(**SMALL), tmp_path_factory.mktemp("runs") / "iql"
+    settings = {"hidden": [32, 32], "discount": 0.0, "learning_rate": 3e-3}
+    train_offline(
+        transitions_of(spec, nu=1.0, count=4000),
+        spec=spec,
+        steps=1000,
+        evaluations=1,
+        folder=folder,
+        protocol={"states_per_region": 64},
+        hyperparameters=settings,
+    )
+    return folder, spec
+
+
+def test_of_iql_only_the_ranking_is_known_from_its_folder_or_its_policy(iql):
+    folder, spec = iql
+    report = critic(folder, spec, states=200)
+    assert (report.algorithm, report.kind, report.gamma) == ("IQL", "Q", 0.0)
+    assert (report.sweeps, report.times) == (None, ())
+    cube = report.region("WD")
+    assert cube.ranking > 0.6
+    assert (cube.claim, cube.finite, cube.continuing, cube.bias) == (None,) * 4
+    assert critic(folder / "policy.npz", spec, states=200) == report
+    with pytest.raises(SMEError, match="critic of Q, not of V"):
+        critic(folder, spec, kind="V")
+    with pytest.raises(SMEError, match="trained on"):
+        critic(folder, "Default")
+
+
+def test_critics_are_those_of_the_learner_and_bc_has_none():
+    data, about = transitions_of(SMESpec(**SMALL), count=100), {"seed": 0}
+    learner = OfflineLearner(IQLHyperparameters(hidden=[8]), data, 32, about)
+    learner.advance(3, lambda step: None)
+    inputs = np.random.default_rng(0).uniform(-1, 1, (50, 7)).astype(np.float32)
+    for learnt, module in zip(learner.critics, learner._networks.critics, strict=True):
+        expected = module(torch.from_numpy(inputs)).detach()
+        np.testing.assert_allclose(learnt(inputs), expected, rtol=0, atol=1e-6)
+        assert learnt.about == {**about, "discount": 0.99}
+    assert OfflineLearner(BCHyperparameters(), data, 32, about).critics == []
+
+
+def test_an_offline_training_is_diagnosed_with_its_critic(iql, laid_out, tmp_path):
+    pytest.importorskip("matplotlib")
+    diagnosis = diagnose(load_run(iql[0]), states=64, episodes=8)
+    assert diagnosis.plan["algorithm"] == "iql"
+    assert diagnosis.measurements.critic.region("visited").ranking is not None
+    verdict = diagnosis.verdict("critic_level")
+    assert (verdict.answer, verdict.reason) == ("cannot tell", "level_of_data")
+    draw(diagnosis, tmp_path)
+    labels = [axes.get_ylabel() for figure in laid_out for axes in figure.axes]
+    assert sum("the critic" in label for label in labels) == 1
+    assert "discounted value" not in labels

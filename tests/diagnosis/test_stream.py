@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, StreamSpec
-from sme_registry.diagnosis import Diagnosis, StreamSubject, diagnose, load_policy, load_run
+from sme_registry.diagnosis import (
+    Diagnosis,
+    StreamSubject,
+    critic,
+    diagnose,
+    load_policy,
+    load_run,
+)
 from sme_registry.diagnosis.behaviour import NetworkState, network_state
 from sme_registry.diagnosis.questions import DOUBTS
 from sme_registry.diagnosis.stream import (
@@ -364,6 +371,13 @@ def test_the_networks_of_a_run_are_those_of_its_snapshots(tmp_path, uses):
         np.testing.assert_array_equal(own.layers[0][0], weights.detach().numpy().T)
     found = diagnose(life, states=64)
     assert [visit.network.hidden for visit in found.visits] == [(12, 8)] * 2
+    rankings = [visit.critic_ranking for visit in found.visits]
+    if uses == "jax:SAC":  # the critics of TD3 see the phase here, and PPO's are of states
+        alone = critic(models[1], found.stream.phases[1].spec, states=64)
+        assert rankings[1] == alone.region("WD").ranking
+        assert all(0 < ranking < 1 for ranking in rankings)
+    else:
+        assert rankings == [None, None]
     assert found.plan["algorithm"] == uses.removeprefix("jax:")
 
 
