@@ -121,30 +121,29 @@ class ProfileFailure(StrictModel):
 class Estimate(NamedTuple):
     """A number over draws with its 95 % interval; NaN where it is unknown."""
 
-    value: float
-    low: float
-    high: float
-    draws: int
+    value: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    draws: int = 0
 
     def __str__(self) -> str:
-        if math.isnan(self.value):
+        return self.text()
+
+    def text(self, number: Callable[[float], str] = fixed) -> str:
+        if not self.draws:
             return "–"
-        ends = "" if math.isnan(self.low) else f" [{fixed(self.low)}, {fixed(self.high)}]"
-        return fixed(self.value) + ends
+        ends = "" if math.isnan(self.low) else f" [{number(self.low)}, {number(self.high)}]"
+        return number(self.value) + ends
 
 
 class Contrast(NamedTuple):
     """The difference of N₀ of two algorithms over pairs of runs, and the verdict on the first."""
 
-    value: float
-    low: float
-    high: float
-    pairs: int
+    difference: Estimate
     verdict: str
 
     def __str__(self) -> str:
-        ends = "" if math.isnan(self.low) else f" [{fixed(self.low)}, {fixed(self.high)}]"
-        return f"{signed(self.value)}{ends}"
+        return self.difference.text(signed)
 
 
 class Profile(StrictModel):
@@ -249,7 +248,7 @@ class Profile(StrictModel):
 
     def _estimate(self, runs: Array, statistic: Callable[[Any], Array], *place: str) -> Estimate:
         if not len(runs):
-            return Estimate(math.nan, math.nan, math.nan, 0)
+            return Estimate()
         bootstrap = Bootstrap(self.plan_digest)
         ends = bootstrap.interval({"": runs}, "profile", *place, statistic=statistic)
         return Estimate(float(statistic(runs)[0]), *ends, len(runs))
@@ -272,7 +271,7 @@ class Profile(StrictModel):
         *_, value, low, high, count, _, verdict = paired(
             pairs, METRICS["wd_regret"], Bootstrap(self.plan_digest), *place
         )
-        return Contrast(value, low, high, count, verdict)
+        return Contrast(Estimate(value, low, high, count), verdict)
 
     def _pairs(self, other: Profile, name: str) -> Array:
         ours, theirs = self.values(name), other.values(name)
@@ -317,7 +316,7 @@ class Profile(StrictModel):
         for verdict in ("better", "worse", "indication"):
             of = {label: each for label, each in contrasts.items() if each.verdict == verdict}
             if of:
-                ordered = sorted(of, key=lambda label: -abs(of[label].value))
+                ordered = sorted(of, key=lambda label: -abs(of[label].difference.value))
                 texts = [f"{label} ({of[label]})" for label in ordered[:3]]
                 more = [f"{len(of) - 3} more"] if len(of) > 3 else []
                 word = "an indication only on" if verdict == "indication" else f"{verdict} on"

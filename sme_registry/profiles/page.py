@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from markupsafe import Markup
 
@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _OTHERS = ("PPO", "TD3", "SAC")  # the order of their colours
-_HIGHEST = 1.3  # N₀ that the figure shows
+_HIGHEST = 1.45  # N₀ that the figure shows
+_LEAST = -0.6  # robustness
 
 
 class _Table(NamedTuple):
@@ -93,16 +94,18 @@ def page(profile: Profile, others: Sequence[Profile], figures: Mapping[str, byte
     )
 
 
-def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, Look]:
+def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, dict[str, Any]]:
     """The profile in front; a method of several discounts has one colour."""
-    looks = {profile.name: new_look(COLOURS[0], MARKERS[0])}
+    looks = {profile.name: dict(new_look(COLOURS[0], MARKERS[0]))}
     for other in others:
         method, _, variant = other.name.partition(" (")
         if method in _OTHERS:
             i = 1 + _OTHERS.index(method)
-            looks[other.name] = new_look(COLOURS[i], MARKERS[i], (0, (2, 1.5)) if variant else "-")
+            looks[other.name] = dict(new_look(COLOURS[i], MARKERS[i]))
+            if variant:
+                looks[other.name] |= {"linestyle": (0, (2, 1.5)), "markerfacecolor": "none"}
         elif other.name == "linear":
-            looks[other.name] = LINEAR
+            looks[other.name] = dict(LINEAR)
     return looks
 
 
@@ -157,7 +160,7 @@ def draw_robustness(profile: Profile, others: Sequence[Profile]) -> Figure:
     axes.set_yticks(range(len(AXES)), [literal(axis.label) for axis in AXES])
     axes.set_ylim(len(AXES) - 0.4, -0.6)
     axes.axvline(1.0, color="black", linewidth=0.9, zorder=1)
-    axes.set_xlim(-0.3, 1.35)
+    axes.set_xlim(_LEAST, 1.35)
     axes.set_xlabel("robustness: share of the performance 1 − N₀ that is kept at the harder levels")
     axes.grid(visible=False, axis="y")
     legend(figure, looks)

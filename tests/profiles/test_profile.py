@@ -1,0 +1,311 @@
+"""Profiles: their plan and references, what follows from their rows, how they are run and shown."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry import Profile
+from sme_registry.errors import OptionError, SpecError, UnknownNameError
+from sme_registry.evaluation.evaluate import resolve_protocol
+from sme_registry.profiles import document, run
+from sme_registry.profiles.document import AXES, DEFAULT, TWO_LAYERS, ProfileRow
+from sme_registry.profiles.page import write_page
+from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
+from sme_registry.studies import run_study
+from tests import commands
+
+PLAN = document.plan_file()
+RELEASED = {  # levels that the catalogue has as tasks
+    "state_dim": "StateDim{}", "action_dim": "ActionDim{}", "k": "Interval{}",
+    "r_min": "MinReward{}", "D": "Survival{}", "shaping-scale": "Foresight{}",
+    "noise-reward": "NoisyReward{}", "observation-distractors": "Distract{}Noise",
+}  # fmt: skip
+SHORT = {"default", "k-25", "D-0_5", TWO_LAYERS}  # levels of the small plan
+AXIS = {axis.harder[0].rpartition("-")[0]: axis for axis in AXES}
+
+
+class TestPlan:
+    def test_its_levels_are_the_catalogues_tasks_in_five_draws(self):
+        classes = {member.name: member for member in PLAN.plan.classes}
+        assert set(classes) == {name for axis in AXES for name in axis.levels}
+        assert all(len(axis.levels) == 3 for axis in AXES)
+        for member in classes.values():
+            assert member.seeds == (1, 2, 3, 4, 5)
+        for stem, name in RELEASED.items():
+            for level in AXIS[stem].harder:
+                value = level.rpartition("-")[2].replace("_", ".")
+                as_id = f"{float(value):.2f}"[-2:] if stem in ("r_min", "D") else value
+                as_id = f"{float(value) * 100:.0f}" if stem == "noise-reward" else as_id
+                task = sme_registry.load(name.format(as_id))
+                assert classes[level].instances[0] == task.derive(seed=1), level
+
+    def test_a_harder_level_differs_from_its_base_in_its_axis_alone(self):
+        settings = {m.name: m.setting.every_field() for m in PLAN.plan.classes}
+        for stem, axis in AXIS.items():
+            for level in axis.harder:
+                base, harder = settings[axis.base], settings[level]
+                changed = {name for name in base if base[name] != harder[name]}
+                assert changed - {"policy_init"} == {stem.partition("-")[0]}
+
+
+class TestReferences:
+    def test_each_that_ships_is_of_this_plan_and_says_of_what(self):
+        references = Profile.references()
+        assert next(iter(references)) == "PPO"
+        known = {algorithm.name: algorithm for algorithm in PLAN.plan.algorithms}
+        for name, profile in references.items():
+            assert profile.algorithm == known[name]
+            assert profile.plan_digest == PLAN.digest
+            assert profile.protocol_digest == PLAN.plan.protocol.digest
+            assert not profile.failures
+            places = [(row.class_name, row.run) for row in profile.rows]
+            assert len(set(places)) == len(places)
+            assert {"numpy", "sme_registry"} <= {*profile.versions}
+            assert {*profile.versions} >= ({"jaxlib"} if profile.learns else set())
+
+    def test_those_that_are_quick_are_whole_and_all_are_small(self):
+        references = Profile.references()
+        for name in ("PPO", "PPO (gamma 0)", "linear", "constant"):
+            assert len(references[name].rows) == references[name].planned == 95
+        folder = sme_registry.spec.catalogue.spec_folder() / "profiles"
+        assert sum(path.stat().st_size for path in folder.glob("*")) < 300_000
+
+    def test_the_constant_is_where_normalised_regret_is_one(self):
+        constant = Profile.references()["constant"]
+        assert all(row.wd_regret == 1.0 for row in constant.rows)
+        assert all(math.isnan(constant.robustness(axis).value) for axis in AXES)
+
+
+def made(regret, *, name="mine", steps=20_000, draws=5, evaluations=20):
+    """A profile whose N₀ is a function of the level and the draw; None for no run."""
+    values = {(m.name, i): regret(m.name, i) for m in PLAN.plan.classes for i in range(draws)}
+    rows = [
+        ProfileRow(
+            class_name=level, run=i, wd_regret=value, ood_regret=value, ood_decay=0.1,
+            online_regret=0.2, evaluations=evaluations,
+            steps_to_half=1000 * (i + 1) if value < 0.5 else None,
+        )
+        for (level, i), value in values.items() if value is not None
+    ]  # fmt: skip
+    return Profile(
+        algorithm=StudyAlgorithm(name=name, uses=name),
+        plan=PLAN.versioned_name,
+        plan_digest=PLAN.digest,
+        protocol_digest=PLAN.plan.protocol.digest,
+        steps=steps,
+        seeds=draws,
+        classes=[member.name for member in PLAN.plan.classes],
+        rows=rows,
+        versions={},
+    )
+
+
+class TestFacts:
+    def test_robustness_is_the_share_of_performance_that_is_kept(self):
+        regrets = {DEFAULT: 0.2, "k-5": 0.4, "k-25": 0.8}
+        profile = made(lambda level, i: regrets.get(level, 0.2) + 0.01 * (i - 2))
+        kept = profile.robustness(AXIS["k"])
+        assert kept.value == pytest.approx((0.6 / 0.8 + 0.2 / 0.8) / 2)
+        assert kept.low < kept.value < kept.high
+        assert kept.draws == 5
+        assert profile.robustness(AXIS["D"]).value == pytest.approx(1.0)
+
+    def test_foresight_and_noise_are_relative_to_two_layers(self):
+        regrets = {TWO_LAYERS: 0.5, "noise-reward-0_3": 0.75, "noise-reward-1": 0.75}
+        profile = made(lambda level, i: regrets.get(level, 0.0))
+        assert profile.robustness(AXIS["noise-reward"]).value == pytest.approx(0.5)
+
+    def test_it_is_unknown_where_nothing_was_learnt_or_a_level_is_missing(self):
+        unlearnt = made(lambda level, i: 0.95)
+        assert math.isnan(unlearnt.robustness(AXIS["k"]).value)
+        assert "learnt too little" in unlearnt.sentences([])[0]
+        partial = made(lambda level, i: None if level == "k-25" else 0.1)
+        assert math.isnan(partial.robustness(AXIS["k"]).value)
+        assert not math.isnan(partial.robustness(AXIS["D"]).value)
+        one_draw_less = made(lambda level, i: None if (level, i) == ("k-25", 3) else 0.1)
+        assert one_draw_less.robustness(AXIS["k"]).draws == 4
+
+    def test_steps_to_half_are_the_median_over_draws(self):
+        assert made(lambda level, i: 0.1).steps_to_half() == 3000
+        assert made(lambda level, i: 0.1 if i < 3 else 0.7).steps_to_half() == 3000
+        assert math.isinf(made(lambda level, i: 0.1 if i < 2 else 0.7).steps_to_half())
+        assert made(lambda level, i: 0.1, evaluations=1).steps_to_half() is None
+
+    def test_verdicts_are_of_pairs_and_fewer_than_five_are_an_indication(self):
+        theirs = made(lambda level, i: 0.5 + 0.05 * i, name="PPO")
+        better = made(lambda level, i: 0.3 + 0.05 * i)
+        contrasts = better.contrasts(theirs)
+        assert {contrast.verdict for contrast in contrasts.values()} == {"better"}
+        k = contrasts[AXIS["k"].label]
+        assert k.difference.value == pytest.approx(-0.2)
+        assert k.difference.draws == 10  # pairs, of two levels
+        few = made(lambda level, i: 0.3 + 0.05 * i, draws=3).contrasts(theirs)
+        assert {contrast.verdict for contrast in few.values()} == {"indication"}
+        noise = made(lambda level, i: 0.6 + (-1) ** i * 0.2)
+        assert noise.contrasts(theirs)["the default"].verdict == "open"
+        text = better.sentences([theirs])[-1]
+        assert text.startswith("Against PPO")
+        assert "better on" in text
+
+    def test_other_steps_and_the_algorithm_itself_are_not_compared(self):
+        ppo, linear = (Profile.references()[name] for name in ("PPO", "linear"))
+        assert made(lambda level, i: 0.1).comparable([ppo, linear]) == [ppo, linear]
+        assert made(lambda level, i: 0.1, steps=500).comparable([ppo, linear]) == [linear]
+        assert ppo.comparable([ppo, linear]) == [linear]
+
+    def test_a_file_reads_back_and_a_newer_one_is_refused(self, tmp_path):
+        profile = made(lambda level, i: 0.1 + 0.01 * i)
+        path = profile.write(tmp_path / "profile.json")
+        assert Profile.read(path) == profile
+        path.write_text(json.dumps(profile.to_dict() | {"schema_version": 2}))
+        with pytest.raises(SpecError, match="Upgrade"):
+            Profile.read(path)
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """A plan of four levels, with few states, in a working directory of its own."""
+    fields = PLAN.plan.to_dict() | {
+        "protocol": resolve_protocol("quick-v1").to_dict(), "steps": 300, "evaluations": 3,
+    }  # fmt: skip
+    fields["classes"] = [member for member in fields["classes"] if member["name"] in SHORT]
+    plan = StudyPlan.from_dict(fields)
+    file = StudyFile(name="profile", digest=plan.digest, plan=plan)
+    for module in (document, run):
+        monkeypatch.setattr(module, "plan_file", lambda: file)
+    monkeypatch.setattr(run, "quick_classes", lambda: (DEFAULT, "k-25"))
+    monkeypatch.chdir(tmp_path)
+    return file
+
+
+def made_of(function, **options):
+    return sme_registry.profile(function, seeds=2, progress=False, **options)
+
+
+@pytest.fixture
+def learner():
+    """Yields a bad policy, and then the optimal one; raises on the second draw of k = 25."""
+
+    def learner(env, steps, seed, action=0.0):
+        learner.calls.append(seed)
+        env.reset(seed=seed)
+        task = env.unwrapped.task
+        for i in range(steps):
+            *_, terminated, truncated, _ = env.step(np.full(task.spec.action_dim, action))
+            if terminated or truncated:
+                env.reset()
+            if i == 150:
+                yield lambda observations: np.ones((len(observations), task.spec.action_dim))
+        if seed == 1 and task.spec.k == 25:
+            raise RuntimeError("boom")
+        yield lambda observations: 2.0 * task.optimal_action(observations[:, :8]) - 1.0
+
+    learner.calls = []
+    return learner
+
+
+class TestRun:
+    def test_it_is_a_study_with_a_page_and_is_continued(self, small, tmp_path, learner):
+        profile = made_of(learner)
+        folder = tmp_path / "runs" / "profile-learner"
+        assert {path.name for path in folder.glob("profile.*")} == {
+            "profile.html", "profile.json", "profile.pdf",
+        }  # fmt: skip
+        assert Profile.read(folder / "profile.json") == profile
+        assert len(profile.rows) == 2 * len(SHORT) - 1
+        (failure,) = profile.failures
+        assert (failure.class_name, failure.run) == ("k-25", 1)
+        assert "boom" in failure.error
+        page = (folder / "profile.html").read_text()
+        assert "boom" in page
+        assert "http://" not in page.replace("http://www.w3.org", "")
+        row = next(row for row in profile.rows if row.class_name == DEFAULT)
+        assert row.wd_regret < 1e-3
+        assert row.evaluations == 3
+        assert 100 < row.steps_to_half <= 300  # the first policy was bad
+        assert profile.algorithm.source.startswith("sha256:")
+        before = len(learner.calls)
+        assert made_of(learner) == profile
+        assert len(learner.calls) == before  # nothing was trained again
+        assert made_of(learner, quick=True).planned == 2 * 2
+        with pytest.raises(OptionError, match="holds the study"):
+            made_of(learner, hyperparameters={"action": 0.5}, folder=folder)
+
+    def test_what_a_function_may_not_do_is_a_failed_run_that_says_so(self, small):
+        def long(env, steps, seed):
+            env.reset()
+            while True:
+                *_, terminated, truncated, _ = env.step(env.action_space.sample())
+                if terminated or truncated:
+                    env.reset()
+
+        def nothing(env, steps, seed):
+            pass
+
+        def narrow(env, steps, seed):
+            return lambda observations: np.zeros((len(observations), 3))
+
+        expected = {long: "takes more than 300 steps", nothing: "returned None", narrow: "4"}
+        for function, message in expected.items():
+            with pytest.raises(OptionError, match=f"no finished run .*{message}"):
+                made_of(function, quick=True)
+
+    def test_what_cannot_be_run_is_refused_before(self, small, learner):
+        def other(env, n):
+            return None
+
+        with pytest.raises(OptionError, match="cannot be called with an environment"):
+            made_of(other)
+        with pytest.raises(OptionError, match="must be a function"):
+            made_of(3)
+        with pytest.raises(OptionError, match="jobs=2: must be 1"):
+            made_of(learner, jobs=2)
+        assert not Path("runs").exists()
+
+    def test_runs_of_a_study_that_covers_it_are_a_profile(self, small, tmp_path):
+        algorithms = [a for a in small.plan.algorithms if a.name in ("linear", "constant")]
+        plan = small.plan.model_copy(update={"algorithms": tuple(algorithms), "seeds": 2})
+        file = StudyFile(name="mine", digest=plan.digest, plan=plan)
+        options = {"executor": "in-process", "progress": False}
+        run_study(file, "study", only=["class=D-0_5"], **options)
+        with pytest.raises(OptionError, match="no finished run on the default"):
+            run.profile_of("study", "linear")
+        run_study(file, "study", only=["class=default", "algorithm=linear"], **options)
+        profile = run.profile_of("study", "linear")
+        assert {row.class_name for row in profile.rows} == {DEFAULT, "D-0_5"}
+        assert profile.planned == 2 * len(SHORT)
+        write_page(profile, tmp_path / "out", [])
+        page = (tmp_path / "out" / "profile.html").read_text()
+        assert "4 of 8 finished, 4 not run" in page
+        with pytest.raises(UnknownNameError, match="Choose one with --algorithm"):
+            run.profile_of("study")
+
+
+class TestCommand:
+    def test_a_reference_is_shown(self):
+        text = commands.good("profile", "show", "ppo").stdout
+        assert "PPO  20,000 steps, 95 of 95 runs" in text
+        shown = json.loads(commands.good("profile", "show", "PPO", "--json").stdout)
+        assert Profile.from_dict(shown) == Profile.references()["PPO"]
+
+    def test_what_is_not_clear_is_refused(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        Path("mine.py").write_text("def train(env, steps, seed): pass\n")
+        Path("json.py").write_text("")
+        for arguments, message in {
+            (): "Give a FILE",
+            ("mine.py", "-a", "PPO"): "Leave one out",
+            ("mine.py", "more"): "one argument too many",
+            ("none.py",): "must be a Python file",
+            ("mine.py:missing",): "has no function 'missing'",
+            ("show", "PPOO"): "Did you mean 'PPO'",
+            ("--runs", "none"): "holds no study",
+            ("--runs", "none", "--quick"): "trains nothing",
+            ("/usr/lib/python3/none.py",): "must be a Python file",
+        }.items():
+            assert message in commands.refused("profile", *arguments), arguments
+        assert not Path("runs").exists()
