@@ -12,7 +12,7 @@ from sme_registry.envs.arguments import initial_states, single_agent
 from sme_registry.errors import OptionError, StateError
 from sme_registry.evaluation.policies import Policy, as_policy
 from sme_registry.evaluation.rollouts import Rollouts, rollouts
-from sme_registry.io import choice, integer_in
+from sme_registry.io import choice, integer_in, number_in
 from sme_registry.spec import SMESpec
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import Task, draw
@@ -66,10 +66,16 @@ def values(
     spec = task.spec
     choice("horizon", horizon, ("finite", "continuing"))
     integer_in("samples", samples, 1)
-    _check_gamma(gamma, horizon)
+    integer_in("seed", seed, 0)
+    number_in("gamma", gamma, 0.0, 1.0)
+    if gamma == 1 and horizon == "continuing":
+        raise OptionError(
+            'horizon="continuing": without an end and with gamma=1, values are infinite. Use '
+            'horizon="finite", or gamma below 1.'
+        )
     s = _states(states, spec.state_dim)
     B = len(s)
-    steps = _each("t", t, B, 0, spec.horizon - 1).astype(np.int64)
+    steps = _each("t", t, B, 0, spec.horizon - 1, whole=True).astype(np.int64)
     r_cum = _each("accumulated", accumulated, B, 0.0, spec.k)
     d = _rows("distractors", distractors, (B, spec.distractors))
     first = _rows("actions", actions, (B, spec.action_dim))
@@ -162,25 +168,27 @@ class _AtEnd:
         return getattr(self._policy, "bonus", 0.0)
 
 
-def _check_gamma(gamma: float, horizon: Horizon) -> None:
-    if not 0 <= gamma <= 1:
-        raise OptionError(f"gamma={gamma!r}: must be a discount in [0, 1].")
-    if gamma == 1 and horizon == "continuing":
-        raise OptionError(
-            'horizon="continuing": without an end and with gamma=1, values are infinite. Use '
-            'horizon="finite", or gamma below 1.'
-        )
-
-
-def _each(name: str, given: npt.ArrayLike, B: int, low: float, high: float) -> Array:
+def _each(
+    name: str, given: npt.ArrayLike, B: int, low: float, high: float, *, whole: bool = False
+) -> Array:
     """A number for each state, from one or from `[B]`."""
-    numbers = np.asarray(given, np.float64)
-    if numbers.shape not in ((), (B,)) or not ((low <= numbers) & (numbers <= high)).all():
+    numbers = _numbers(given)
+    allowed = (low <= numbers) & (numbers <= high) & (not whole or numbers == np.rint(numbers))
+    if numbers.shape not in ((), (B,)) or not allowed.all():
+        kind = "integer" if whole else "number"
         raise OptionError(
-            f"{name}={given!r:.80}: must be one number or {B}, one for each state, in "
+            f"{name}={given!r:.80}: must be one {kind} or {B}, one for each state, in "
             f"[{low:g}, {high:g}]."
         )
     return np.broadcast_to(numbers, (B,)).copy()
+
+
+def _numbers(given: npt.ArrayLike) -> Array:
+    """An array of float64; NaN where it is none."""
+    try:
+        return np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        return np.array(np.nan)
 
 
 def _rows(name: str, given: npt.ArrayLike | None, shape: tuple[int, int]) -> Array | None:
@@ -188,7 +196,7 @@ def _rows(name: str, given: npt.ArrayLike | None, shape: tuple[int, int]) -> Arr
 
 
 def _states(states: npt.ArrayLike, state_dim: int) -> Array:
-    s = np.asarray(states, np.float64)
+    s = _numbers(states)
     if s.ndim != 2 or s.shape[1] != state_dim or not np.isfinite(s).all():
         raise StateError(f"states of shape {s.shape}: must be finite, of shape [B, {state_dim}].")
     return s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import importlib.machinery
 import importlib.util
 import ipaddress
@@ -35,11 +36,17 @@ def versions(packages: Iterable[str], *, if_imported: Iterable[str] = ()) -> dic
     """Versions of this package, of Python, and of the named packages that are installed."""
     installed = {"sme_registry": __version__, "python": platform.python_version()}
     for name in (*packages, *(name for name in if_imported if name in sys.modules)):
-        try:
-            installed[name] = metadata.version(name)
-        except (metadata.PackageNotFoundError, ValueError):  # ValueError: an empty name
-            continue
+        if version := _version(name):
+            installed[name] = version
     return installed
+
+
+@functools.cache  # it searches the whole path, and a study asks of every cell
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except (metadata.PackageNotFoundError, ValueError):  # ValueError: an empty name
+        return None
 
 
 def is_installed(package: str) -> bool:

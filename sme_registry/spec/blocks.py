@@ -213,7 +213,7 @@ class NoiseSpec(Document):
     def _observations_have_none(cls, data: Any) -> Any:
         if isinstance(data, dict) and "observation" in data:
             raise ValueError(
-                "noise.observation: must be left out, because noise of the observation would hide "
+                "observation: must be left out, because noise of the observation would hide "
                 "the state, and the optimum would not be known. Use reward or transition."
             )
         return data

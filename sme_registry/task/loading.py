@@ -103,6 +103,8 @@ def save(
       True
     """
     document = as_document(spec)
+    if Path(path).is_dir():
+        raise OptionError(f"{path}: is a folder. Give a file, such as {Path(path) / 'task.json'}.")
     with contextlib.suppress(SMEError):
         force = force or resolve(Path(path)).document == document
     check_new(path, force=force)

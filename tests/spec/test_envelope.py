@@ -199,8 +199,9 @@ def test_saving_under_a_bad_name_writes_nothing(tmp_path):
         sme_registry.save(SMESpec(), tmp_path / "my task.json")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "task").mkdir()
-    with pytest.raises(OptionError, match="cannot be written"):
-        sme_registry.save(SMESpec(), tmp_path / "task", force=True)
+    for force in (True, False):
+        with pytest.raises(OptionError, match=r"task: is a folder\. Give a file"):
+            sme_registry.save(SMESpec(), tmp_path / "task", force=force)
 
 
 def test_only_force_replaces_the_file_of_another_task_and_whole(saved):
