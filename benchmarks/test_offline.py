@@ -1,6 +1,6 @@
 """A gradient step of BC and IQL, including sampling, compared with d3rlpy's where it is installed.
 
-`make bench` does not install d3rlpy; docs/results/offline_learners.md describes that measurement.
+`make bench` does not install d3rlpy; docs/results/offline.md describes that measurement.
 Without it, the peer is a step of Stable-Baselines3's TD3 with equal layers, as a reference for the
 cost of such a step and not as a target.
 """

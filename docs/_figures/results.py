@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import re
+import csv
 import tempfile
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sme_registry import statistics
 from sme_registry.diagnosis import diagnose, load_policy
 from sme_registry.diagnosis.figures import draw
 from sme_registry.evaluation import EvaluationReport
@@ -124,16 +126,22 @@ def ranks() -> Figure:
 
 
 def baselines() -> dict[str, list[tuple[float, float, float]]]:
-    """θ, low and high of N₀ and of N̄, by method, as the page of the baselines has them."""
-    page = (RESULTS / "baselines.md").read_text(encoding="utf-8")
-    estimate = r"([\d.]+) \(([\d.]+) to ([\d.]+)\)"
-    rows = re.findall(rf"^\| (\w+) \| {estimate} \| {estimate} \|", page, re.M)
-    if len(rows) != 3:
-        raise ValueError(f"baselines.md: {len(rows)} rows with two estimates, must be 3.")
-    return {
-        name: [(*map(float, numbers[i : i + 3]),) for i in (0, 3)]  # type: ignore[misc]
-        for name, *numbers in rows
-    }
+    """θ, low and high of N₀ and of N̄, by method, by the rule of a board."""
+    with (RESULTS / "baselines.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = {}
+    for method in ("TD3", "PPO", "SAC"):
+        # A board's score of a class is the mean over its instances, of which each has two here.
+        instances: dict[str, Any] = defaultdict(list)
+        for row in rows:
+            if row["method"] == method:
+                scores = [float(row["wd_regret"]), float(row["ood_regret"])]
+                instances[f"{row['class_name']} {row['spec_digest']}"].append(scores)
+        instances = {name: np.array(scores) for name, scores in instances.items()}
+        low, high = statistics.stratified_bootstrap(instances, 10_000, "baselines")
+        estimates = np.stack([statistics.aggregate(instances), low, high], axis=1)
+        found[method] = [tuple(estimate) for estimate in estimates.round(3).tolist()]
+    return found
 
 
 def _cells(study: str) -> Iterator[dict[str, Any]]:

@@ -56,9 +56,9 @@ _TOGETHER = ("wd_regret", "ood_regret")
 _LIMITS = "limits-and-distractors"
 # A setting has the rows of the first page that knows it.
 STUDIES = (
-    Study("ablations-in-jax/runs-20000.csv", "ablations_in_jax.md", "paper-ablations", _BY_REGION),
-    Study("ablations-in-jax/runs.csv", "ablations_in_jax.md", "paper-ablations", _BY_REGION),
-    Study("baselines.csv", "baselines.md", "smoke", _TOGETHER),
+    Study("ablations-in-jax/runs-20000.csv", "ablations.md", "paper-ablations", _BY_REGION),
+    Study("ablations-in-jax/runs.csv", "ablations.md", "paper-ablations", _BY_REGION),
+    Study("baselines.csv", "ablations.md#on-smoke-v1-by-the-rule-of-a-board", "smoke", _TOGETHER),
     *(
         Study(
             f"{_LIMITS}/{name}.csv",

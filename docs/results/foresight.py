@@ -10,7 +10,7 @@ five minutes of processor time with PPO, and an hour and a half each with TD3 an
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,7 @@ def run(algorithm: str, folder: Path, jobs: int | None) -> None:
     """Train the runs that the folder lacks, and write their rows and those of their critics."""
     for gamma in BUDGETS[algorithm][1]:
         file, place = plan(algorithm, gamma), folder / f"gamma-{gamma:g}"
-        run_study(file, place, keep_models=True, jobs=jobs)
+        run_study(file, place, keep_models=True, jobs=jobs, retry_failed=True)
         results, _ = load(place)
         runs = compact(results.assign(gamma=gamma))
         append(runs, FOLDER / "runs.csv", ["algorithm", "gamma"])
@@ -129,7 +129,7 @@ def append(rows: pd.DataFrame, path: Path, key: list[str]) -> None:
 def grid(runs: pd.DataFrame, kind: str, value: str = "wd_regret") -> pd.DataFrame:
     """Means over runs, a row for each scale of the shaping and a column for each discount."""
     rows = runs[runs["class_name"].str.match(rf"plain|{kind}-")]
-    scale = rows["class_name"].str.extract(r"-(\d+)")[0].fillna(0).astype(int)
+    scale = rows["class_name"].str.extract(r"-(\d+)")[0].astype(float).fillna(0)
     table = rows.assign(c=scale).pivot_table(index="c", columns="gamma", values=value)
     return table.sort_index()
 
@@ -191,10 +191,11 @@ def draw_grids(figure: Figure, runs: pd.DataFrame) -> None:
             axes.set_yticks(range(table.shape[0]), [f"{c:g}" for c in table.index])
             for (i, j), value in np.ndenumerate(table.to_numpy()):
                 dark = "white" if value > 0.6 * top else "black"
-                shown = f"{value:.2f}".replace("-", "−")
+                shown = f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
                 axes.text(j, i, shown, ha="center", va="center", color=dark, size=8)
             axes.set(title=f"{algorithm}: {title}", xlabel="γ of the learner", ylabel="c")
             axes.tick_params(length=0)
+            axes.grid(visible=False)
 
 
 def draw_critics(figure: Figure, joined: pd.DataFrame) -> None:
@@ -220,6 +221,39 @@ def draw_critics(figure: Figure, joined: pd.DataFrame) -> None:
     legend_below(figure, figure.axes[0].get_legend_handles_labels()[0])
 
 
+def rows() -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The runs, and what their critics say in each region."""
+    return tuple(pd.read_csv(FOLDER / f"{name}.csv") for name in ("runs", "critics"))
+
+
+def tables() -> Iterator[tuple[str, pd.DataFrame]]:
+    """Each table of the page, with its title."""
+    runs, criticisms = rows()
+    cube = ranked(runs, criticisms, ["WD"])
+    yield "policies that learn nothing", runs[["random", "linear"]].mean().to_frame().T
+    for algorithm, own in runs.groupby("algorithm", sort=False):
+        for kind in ("misleading", "control"):
+            yield f"{algorithm}, {kind}: N₀", grid(own, kind)
+    yield "misleading − control", foresight(runs)
+    yield "noise: N₀", noise(runs)
+    for algorithm, own in cube.groupby("algorithm", sort=False):
+        for value in ("ranking", "misled_ranking", "bias_share"):
+            if own[value].notna().any():
+                for kind in ("misleading", "control"):
+                    yield f"{algorithm}, {kind}: {value}", grid(own, kind, value)
+    plain = criticisms[criticisms["class_name"] == "plain"]
+    by_region = plain.pivot_table(
+        index=["algorithm", "gamma"], columns="region", values="ranking", sort=False
+    )
+    yield "ranking by region, plain", by_region
+    yield "Spearman's ρ with N₀", associations(cube)
+
+
+def printed() -> str:
+    """The tables of the page."""
+    return "\n\n".join(f"{title}\n{table.round(2).to_string()}" for title, table in tables())
+
+
 def main() -> None:
     """Print the tables and draw the figures, after training if asked."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -229,22 +263,9 @@ def main() -> None:
     if options.run:
         algorithm, folder = options.run
         run(algorithm, Path(folder), options.jobs)
-    runs, criticisms = (pd.read_csv(FOLDER / f"{name}.csv") for name in ("runs", "critics"))
-    print(runs.groupby("algorithm", sort=False)[["random", "linear"]].mean().round(2), "\n")
-    for algorithm, own in runs.groupby("algorithm", sort=False):
-        for kind in ("misleading", "control"):
-            print(f"{algorithm}, {kind}: N₀\n{grid(own, kind).round(2)}\n")
-    print(f"misleading − control\n{foresight(runs).round(2).to_string()}\n")
-    print(f"noise: N₀\n{noise(runs).round(2).to_string()}\n")
+    print(printed())
+    runs, criticisms = rows()
     cube = ranked(runs, criticisms, ["WD"])
-    for algorithm, own in cube.groupby("algorithm", sort=False):
-        for value in ("ranking", "misled_ranking", "bias_share"):
-            if own[value].notna().any():
-                for kind in ("misleading", "control"):
-                    print(f"{algorithm}, {kind}: {value}\n{grid(own, kind, value).round(2)}\n")
-    outside = criticisms[criticisms["class_name"] == "plain"]
-    print(outside.pivot_table(index=["algorithm", "gamma"], columns="region", values="ranking"))
-    print(f"\nSpearman's ρ with N₀\n{associations(cube)}")
     with styled():
         grids, points = new_figure((6.4, 7.0)), new_figure((6.0, 2.8))
         draw_grids(grids, runs)

@@ -1,23 +1,30 @@
-"""Tables of docs/results/ablations_in_jax.md, from the compact results beside it.
+"""The tables of pages of results, from the rows beside them.
 
-    python docs/results/summary.py docs/results/ablations-in-jax/runs.csv
-    python docs/results/summary.py runs.csv --from report/tables/results.csv
+    python docs/results/summary.py ablations
+    python docs/results/summary.py ablations --rows runs.csv --from report/tables/results.csv
 
-The second form first writes `runs.csv`, one row a run, from the table that `sme study report`
-writes with one row a run and region.
+The second form first writes `runs.csv`, one row a run, from the table that `sme study report
+--full` writes with one row a run and region.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 from scipy import stats
 
+from sme_registry import evaluate, load
+
+RESULTS = Path(__file__).parent
 RUN = ["algorithm", "class_name", "run", "steps", "complexity", "spec_digest", "seed", "uses"]
 KEPT = ["online_regret", "linear_normalised_regret"]
 BY_REGION = ["normalised_regret", "similarity"]
+MARGIN = 0.02  # of N₀, within which two implementations count as equal
 
 
 def compact(results: pd.DataFrame) -> pd.DataFrame:
@@ -29,54 +36,154 @@ def compact(results: pd.DataFrame) -> pd.DataFrame:
     return kept.join(wide).reset_index().round(6)
 
 
-def with_losses(runs: pd.DataFrame) -> pd.DataFrame:
-    """The runs with `loss_1` and `loss_5`: (r̃_WD − r̃_m)/r̃_WD, per cent, METHOD section 3."""
+def rows(*path: str) -> pd.DataFrame:
+    """The rows of a page, with `loss_1` and `loss_5`: (r̃_WD − r̃_m)/r̃_WD in per cent."""
+    runs = pd.read_csv(RESULTS.joinpath(*path))
     for m in (1, 5):
         lost = runs["similarity_0"] - runs[f"similarity_{m}"]
         runs[f"loss_{m}"] = 100.0 * lost / runs["similarity_0"]
     return runs
 
 
-def average_loss(runs: pd.DataFrame) -> pd.DataFrame:
-    """Mean and SD of the losses over runs, by algorithm and by whether L is 1."""
-    depth = runs["complexity"].map(lambda L: "L = 1" if L == 1 else "L > 1")
-    parts = [runs.assign(tasks="all"), runs.assign(tasks=depth)]
-    grouped = pd.concat(parts).groupby(["algorithm", "tasks"])
-    table = grouped.agg(
-        runs=("loss_1", "size"),
-        loss_1=("loss_1", "mean"),
-        sd_1=("loss_1", "std"),
-        loss_5=("loss_5", "mean"),
-        sd_5=("loss_5", "std"),
-    )
-    for name, group in grouped:
-        rank = stats.spearmanr(group["similarity_0"], group["loss_5"])
-        table.loc[name, "spearman"] = rank.statistic
-    return table.round(2)
-
-
 def classes(runs: pd.DataFrame) -> pd.DataFrame:
-    """N₀, N̄ and the loss in the outermost shell of each class, means over runs."""
+    """N₀, N̄, the loss in the outermost shell and online regret of each class, means over runs."""
     shells = [f"normalised_regret_{m}" for m in range(1, 6)]
     runs = runs.assign(ood_regret=runs[shells].mean(axis=1), wd_regret=runs["normalised_regret_0"])
-    values = ["wd_regret", "ood_regret", "loss_5", "online_regret"]
+    values = ["wd_regret", "ood_regret", "loss_5", "online_regret", "linear_normalised_regret"]
     order = list(dict.fromkeys(runs["class_name"]))
     table = runs.pivot_table(index="class_name", columns="algorithm", values=values, aggfunc="mean")
-    return table.loc[order].round(3)
+    return table.loc[order, values].round(3)
+
+
+def each_run(runs: pd.DataFrame) -> pd.DataFrame:
+    """N₀ of every run of a class, in order."""
+    rounded = runs.assign(n=runs["normalised_regret_0"].map("{:.2f}".format))
+    return rounded.pivot_table(
+        index="class_name", columns="algorithm", values="n", aggfunc=", ".join, sort=False
+    )
+
+
+def losses(runs: pd.DataFrame) -> pd.DataFrame:
+    """What is lost outside, and how it goes with r̃_WD: ρ over runs, and over ranks in classes."""
+    depth = runs["complexity"].map(lambda L: "L = 1" if L == 1 else "L > 1")
+    parts = pd.concat([runs.assign(tasks="all"), runs.assign(tasks=depth)])
+    table = {}
+    for key, group in parts.groupby(["algorithm", "tasks"], sort=False):
+        pair = group[["similarity_0", "loss_5"]]
+        ranks = pair.groupby(group["class_name"]).rank()
+        table[key] = {
+            "runs": len(group),
+            "loss_1": group["loss_1"].mean(),
+            "sd_1": group["loss_1"].std(),
+            "loss_5": group["loss_5"].mean(),
+            "sd_5": group["loss_5"].std(),
+            "ρ within classes": ranks.corr().iloc[0, 1],
+            "ρ pooled": stats.spearmanr(*pair.to_numpy().T).statistic,
+            **cosines(*pair.to_numpy().T),
+        }
+    return pd.DataFrame(table).T.round(2)
+
+
+def cosines(x: np.ndarray, y: np.ndarray, draws: int = 2_000) -> dict[str, float]:
+    """The cosine of r̃_WD and loss, and its distribution with losses permuted between runs."""
+    rng = np.random.default_rng(0)
+
+    def cosine(other: np.ndarray) -> float:
+        return float(x @ other / np.sqrt((x @ x) * (other @ other)))
+
+    permuted = [cosine(rng.permutation(y)) for _ in range(draws)]
+    low, high = np.quantile(permuted, [0.025, 0.975])
+    return {"cosine": cosine(y), "permuted": np.mean(permuted), "low": low, "high": high}
+
+
+def references(*names: str) -> pd.DataFrame:
+    """N₀, N̄ and the decay, in per cent, of the policies that learn nothing: means of five draws."""
+    table: dict[Any, dict[str, float]] = {}
+    for name in names:
+        for policy in ("linear", "constant", "random"):
+            reports = [
+                evaluate(policy, load(name).derive(seed=seed), "quick-v1") for seed in range(1, 6)
+            ]
+            similarity = np.array([[r.similarity for r in report.regions] for report in reports])
+            lost = 100.0 * (1.0 - similarity[:, 1:] / similarity[:, :1])
+            table[name, policy] = {
+                "N0": np.mean([report.wd_regret for report in reports]),
+                "mean N": np.mean([report.ood_regret for report in reports]),
+                "mean loss": lost.mean(),
+                "loss_5": lost[:, -1].mean(),
+            }
+    return pd.DataFrame(table).T.round(2)
+
+
+def equality(runs: pd.DataFrame) -> pd.DataFrame:
+    """JAX minus SB3 in N₀: two one-sided t-tests against a margin, over pairs by instance."""
+    wide = runs.pivot_table(
+        index=["class_name", "run"], columns="algorithm", values="normalised_regret_0", sort=False
+    )
+    table = {}
+    for algorithm in ("PPO", "TD3", "SAC"):
+        for name, group in wide.groupby(level=0, sort=False):
+            change = group[f"jax-{algorithm}"] - group[algorithm]
+            n, mean = len(change), change.mean()
+            error = change.std() / np.sqrt(n)
+            arm = stats.t.ppf(0.95, n - 1) * error
+            p = max(
+                stats.t.sf((mean + MARGIN) / error, n - 1),
+                stats.t.cdf((mean - MARGIN) / error, n - 1),
+            )
+            table[algorithm, name] = {
+                "JAX": group[f"jax-{algorithm}"].mean(),
+                "SB3": group[algorithm].mean(),
+                "difference": mean,
+                "low": mean - arm,
+                "high": mean + arm,
+                "p": p,
+                "excluded above": max(abs(mean - arm), abs(mean + arm)),
+            }
+    return pd.DataFrame(table).T.round(3)
+
+
+def ablations() -> Iterator[Any]:
+    """Levels by class, and of policies that learn nothing."""
+    yield classes(rows("ablations-in-jax", "runs.csv"))
+    runs = rows("ablations-in-jax", "runs-20000.csv")
+    yield each_run(runs)
+    yield classes(runs)["wd_regret"]
+    yield runs.groupby("algorithm")["normalised_regret_0"].agg(["mean", "std"]).round(2)
+    yield references("Default", "Complexity10")
+
+
+def decay() -> Iterator[Any]:
+    """Losses outside the cube, and what goes with them."""
+    for name in ("runs.csv", "runs-20000.csv"):
+        yield losses(rows("ablations-in-jax", name))
+    yield references("Default", "Complexity10")
+
+
+def agents() -> Iterator[Any]:
+    """Whether the two implementations learn alike."""
+    yield equality(rows("equal-agents", "runs.csv"))
+
+
+PAGES = {page.__name__: page for page in (ablations, decay, agents)}
+
+
+def printed(page: str) -> str:
+    """The tables of a page."""
+    return "\n\n".join(table.to_string() for table in PAGES[page]())
 
 
 def main() -> None:
-    """Print the tables, after writing the runs if a report's table is given."""
+    """Print the tables, after writing the rows if a report's table is given."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("runs", type=Path)
+    parser.add_argument("page", choices=PAGES)
+    parser.add_argument("--rows", type=Path)
     parser.add_argument("--from", dest="results", type=Path, nargs="*", default=[])
     options = parser.parse_args()
     if options.results:
         frames = pd.concat(pd.read_csv(path) for path in options.results)
-        compact(frames).to_csv(options.runs, index=False)
-    runs = with_losses(pd.read_csv(options.runs))
-    print(average_loss(runs).to_string(), "\n")
-    print(classes(runs).to_string())
+        compact(frames).to_csv(options.rows, index=False)
+    print(printed(options.page))
 
 
 if __name__ == "__main__":

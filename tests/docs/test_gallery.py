@@ -116,7 +116,7 @@ def test_results_are_those_of_the_same_setting():
     assert [(each.algorithm, each.steps, len(each.cube)) for each in of("Default")] == [
         ("PPO", 20_000, 2), ("TD3", 20_000, 2), ("SAC", 20_000, 2), ("PPO", 100_000, 10),
     ]  # fmt: skip
-    # As docs/results/ablations_in_jax.md and baselines.md have them.
+    # As docs/results/ablations.md has them.
     assert np.mean(of("Complexity50")[-1].cube) == pytest.approx(0.923, abs=5e-4)
     plane = {each.algorithm: float(iqm(each.shells)) for each in of("Plane10")}
     assert plane == pytest.approx({"TD3": 0.411, "PPO": 0.673, "SAC": 0.229}, abs=5e-4)

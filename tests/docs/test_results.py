@@ -1,6 +1,7 @@
-"""The scripts beside the pages of results find what the pages say, on less."""
+"""What the pages of results say is what their scripts find, in committed rows or on less."""
 
 import importlib
+import re
 import sys
 from pathlib import Path
 
@@ -35,3 +36,29 @@ def test_a_plan_without_cost_beats_the_safe_projection_but_not_where_its_price_i
         assert earned.mean() >= plans.projected(task, 0).mean() + gain - 1e-9
         if task.spec.compensated:
             assert earned.max() <= 40.0 + 1e-9
+
+
+def printed(script, page):
+    return script("foresight").printed() if page == "foresight" else script("summary").printed(page)
+
+
+@pytest.mark.parametrize(
+    ("page", "begin", "end"),
+    [
+        ("ablations", "## PPO, ten runs", "## On `smoke-v1`"),
+        ("decay", "| 100,000 steps", "The paper reports"),
+        ("decay", "| | cosine", "It is no evidence"),
+        ("foresight", "| misleading − control", "- **On the plain"),
+        ("foresight", "## Noise", "## What is missing"),
+        ("agents", "JAX minus SB3 in N₀", "A run of TD3"),
+    ],
+)
+def test_the_numbers_of_a_table_are_those_of_the_committed_rows(page, begin, end, script):
+    pytest.importorskip("pandas")
+    text = (RESULTS / f"{page}.md").read_text(encoding="utf-8")
+    text = text[text.index(begin) : text.index(end)].replace("−", "-")
+    tables = "\n".join(re.findall(r"^\|.*", text, re.M))
+    told = re.findall(r"-?\d+\.\d\d+", re.sub(r"= [\d., ]+", "", tables))
+    found = re.findall(r"-?\d+\.\d+", printed(script, page))
+    assert len(told) > 5
+    assert {float(number) for number in told} <= {float(number) for number in found}

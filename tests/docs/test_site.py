@@ -12,7 +12,7 @@ from tests.docs.conftest import ROOT, TUTORIALS
 WIDTHS = {"phone": 400, "desktop": 1280}
 SAMPLE = (
     "index", "tutorials/first_agent", "tutorials/sweep_figure", 
-    "guides/studies", "guides/training", "explanation/method", "results/ablations_in_jax",
+    "guides/studies", "guides/training", "explanation/method", "results/ablations",
     "reference/generated/catalogue", "reference/generated/catalogue-safety", "reference/sme",
     "reference/generated/files",
     "reference/python/sme_registry", "reference/python/sme_registry.spec", "genindex",

@@ -1,4 +1,4 @@
-"""The tables and the figure of docs/results/season.md, from a board with revealed seasons.
+"""The tables and the figure of a board with revealed seasons.
 
 python docs/results/season/tables.py docs/results/season/board
 python docs/results/season/tables.py docs/results/season/board --figure curves.png

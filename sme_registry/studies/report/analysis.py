@@ -49,8 +49,8 @@ from sme_registry.studies.report.design import (
 from sme_registry.studies.report.frames import FinishedLife, frame, ordered
 from sme_registry.studies.result import CellResult
 
-# With fewer runs an interval is an indication only: docs/results/coverage.py measures how often it
-# covers the truth.
+# With fewer runs an interval is an indication only: docs/results/interval_coverage.py measures how
+# often it covers the truth.
 ENOUGH_RUNS = 5
 OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at all
 PLACE = ["class_name", "algorithm"]

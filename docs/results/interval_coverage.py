@@ -1,6 +1,6 @@
 """The table of docs/explanation/statistics.md: how often a 95 % interval contains the truth.
 
-    python docs/results/coverage.py
+    python docs/results/interval_coverage.py
 
 The truth is the IQM, or the mean, of infinitely many runs. A share has a standard error of at most
 0.8 points.
