@@ -165,7 +165,19 @@ def agents() -> Iterator[Any]:
     yield equality(rows("equal-agents", "runs.csv"))
 
 
-PAGES = {page.__name__: page for page in (ablations, decay, agents)}
+def continual() -> Iterator[Any]:
+    """Metrics of lives in the cube, and N at the end of each visit, of lives and fresh agents."""
+    metrics = pd.read_csv(RESULTS / "continual" / "metrics.csv")
+    metrics = metrics[metrics["region"] == "WD"]
+    table = metrics.set_index(["class_name", "algorithm", "metric"])[["iqm", "low", "high"]]
+    yield table.round(2)
+    visits = pd.read_csv(RESULTS / "continual" / "visits.csv")
+    visits = visits[(visits["region"] == "WD") & (visits["metric"] == "normalised_regret")]
+    place = ["class_name", "algorithm"]
+    yield visits.pivot_table(index=place, columns="visit", values="iqm", sort=False).round(2)
+
+
+PAGES = {page.__name__: page for page in (ablations, decay, agents, continual)}
 
 
 def printed(page: str) -> str:

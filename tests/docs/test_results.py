@@ -50,6 +50,7 @@ def printed(script, page):
         ("decay", "| | cosine", "It is no evidence"),
         ("foresight", "| misleading − control", "- **On the plain"),
         ("foresight", "## Noise", "## What is missing"),
+        ("continual", "| | | N at visits", "![Plasticity"),
         ("agents", "JAX minus SB3 in N₀", "A run of TD3"),
     ],
 )
