@@ -113,13 +113,6 @@ def test_the_command_alone_shows_the_help_and_nothing_else():
     assert "error" not in result.output
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_help_of_each_command_has_examples(command: str) -> None:
-    text = good(command, "--help").stdout
-    assert "Examples:" in text
-    assert text.count(f"sme {command}") >= 3  # the usage line and two examples
-
-
 @pytest.mark.parametrize(
     "arguments",
     [("frob",), ("train",), ("list", "--kind", "x"), ("new",), ("train", "Default", "-n", "many")],
@@ -418,35 +411,19 @@ class TestNew:
         ("options", "message"),
         [
             (("--complexity", "0"), "complexity=0: must be"),
-            (("--r-min", "1"), "r_min=1"),
-            (("--seed", "-3"), "seed=-3"),
             (("--state-dim", "1000000", "--action-dim", "1000000"), "GiB"),
-            (("--team", '{"agents": [{"action_dim": 3}]}'), "action_dim=4"),
             (("--team", "two"), "team='two': must be"),
-            (
-                ("--safety", '{"tightness": 0.6}'),
-                "safety.tightness=0.6: must be in",
-            ),
-            (
-                ("--observation", '{"distractors": 1000000}', "--D", "0.5", "--safety", "{}"),
-                "Add it",
-            ),
-            (("--from", "Team2", "--observation", '{"distractors": 1}'), "a team (2 agents)"),
+            (("--safety", '{"tightness": 0.6}'), "safety.tightness=0.6: must be in"),
             (("--team", "two", "--agents", "2"), "one or the other"),
             (("--agents", "3"), "shared equally"),
             (("--agents", "1000000000"), "1,024"),
             (("--agents", "2", "--action-dim", "5"), "cannot be shared equally"),
-            (("--team", '{"agents": [{"action_dim": 4}], "reward": "both"}'), "reward='both'"),
             (("--from", "Defalt"), "Did you mean"),
             (("--name", "a b"), "name='a b'"),
         ],
     )
     def test_bad_input_leaves_no_file(self, options, message, tmp_path):
         assert message in refused("new", "a.json", *options)
-        assert list(tmp_path.iterdir()) == []
-
-    def test_a_file_without_the_ending_that_makes_it_a_path_is_refused(self, tmp_path):
-        assert "must end in .json" in refused("new", "mine")
         assert list(tmp_path.iterdir()) == []
 
 
@@ -498,13 +475,6 @@ class TestValidate:
             assert name in results[name]["error"]
         assert "8 of 9 files are invalid" in result.stderr
 
-    def test_a_suite_with_a_wrong_digest_is_bad(self, tmp_path):
-        plain = catalogue.find(SuiteFile, "smoke").to_dict()
-        plain["suite"]["classes"][0]["seeds"] = [77]
-        (tmp_path / "suite.json").write_text(json.dumps(plain))
-        assert "digest=" in sme("check", "suite.json").stdout
-        refused("check", "suite.json")
-
     def test_an_empty_folder_is_refused(self, tmp_path):
         (tmp_path / "empty").mkdir()
         assert "no .json" in refused("check", "empty")
@@ -535,20 +505,6 @@ class TestCertify:
         # Nothing else shows it.
         assert {check["outcome"] for check in checks.values()} == {"passed", "reported"}
 
-    def test_a_suite_is_certified_task_by_task(self):
-        text = good("check", "smoke").stdout
-        assert len(text.splitlines()) == 1 + len(catalogue.find(SuiteFile, "smoke").suite.instances)
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            (("Defalt",), "Did you mean"),
-            (("Default", "--seed", "-1"), "seed=-1"),
-        ],
-    )
-    def test_bad_input(self, arguments, message):
-        assert message in refused("check", *arguments)
-
 
 QUICK = ("--protocol", "quick-v1")
 
@@ -561,29 +517,14 @@ def save_life():
 
 
 class TestEvaluate:
-    @pytest.mark.parametrize(
-        ("policy", "reference", "close"),
-        [
-            ("optimal", "optimal", 1e-6),
-            ("constant", "constant", 1e-12),
-            ("linear", "linear", 0.01),
-            ("random", "random", 0.02),
-        ],
-    )
-    def test_a_reference_policy_scores_as_in_every_report(self, policy, reference, close):
-        report = json.loads(good("evaluate", policy, "Default", *QUICK, "--json").stdout)
-        team = json.loads(good("evaluate", policy, "TeamBlind4", *QUICK, "--json").stdout)
+    def test_a_team_has_the_scores_of_its_agents_and_on_request_shows_them(self):
+        shown = ("evaluate", "constant", "TeamBlind4", *QUICK)
+        team = json.loads(good(*shown, "--json").stdout)
         assert list(team["agents"]) == [f"agent_{i}" for i in range(4)]
-        for part in (report, *team["agents"].values()):
-            similarity = [region["similarity"] for region in part["regions"]]
-            expected = [region["similarity"] for region in part["references"][reference]]
-            assert similarity == pytest.approx(expected, abs=close)
-        if policy == "constant":
-            shown = ("evaluate", policy, "TeamBlind4", *QUICK)
-            assert "agent_3" in good(*shown, "--all").stdout
-            lines = [line for line in good(*shown).stdout.splitlines() if line.startswith("  ")]
-            names = [line.split("  ")[1] for line in lines if not line.startswith("    ")]
-            assert names == 2 * ["constant", "linear", "random", "optimal"]
+        assert "agent_3" in good(*shown, "--all").stdout
+        lines = [line for line in good(*shown).stdout.splitlines() if line.startswith("  ")]
+        names = [line.split("  ")[1] for line in lines if not line.startswith("    ")]
+        assert names == 2 * ["constant", "linear", "random", "optimal"]
 
     def test_a_function_is_the_policy_that_a_team_shares(self, tmp_path):
         (tmp_path / "shared_for_the_test.py").write_text(
@@ -640,10 +581,7 @@ class TestEvaluate:
         ("arguments", "message"),
         [
             (("optmal", "Default"), "Did you mean 'optimal'"),
-            (("no_such_module:act", "Default"), "cannot be imported"),
-            (("math:pi", "Default"), "must be a function"),
             (("math:sqrt", "Default"), "failed on observations"),
-            (("nowhere.zip", "Default"), "does not exist"),
             (("optimal", "Defalt"), "Did you mean"),
             (("optimal", "Default", "--protocol", "papr-v1"), "Did you mean 'paper-v1'"),
             (("optimal", "Default", "--set", "complexity"), "NAME=VALUE"),
@@ -698,10 +636,6 @@ class TestEvaluate:
         save_life()
         assert message in refused("evaluate", *arguments, *QUICK, "--out", "ev")
         assert [path.name for path in tmp_path.iterdir()] == ["life.json"]
-
-    def test_a_zip_that_is_no_model_is_refused(self, tmp_path):
-        (tmp_path / "a.zip").write_bytes(b"not a zip")
-        assert "not a model" in refused("evaluate", "a.zip", "Default")
 
 
 SHORT = ("train", "Plane1", "-n", "120", *QUICK)
@@ -763,13 +697,9 @@ class TestTrain:
             (("-a", "TD33"), "Did you mean 'TD3'"),
             (("--agents", "jx"), "agents='jx'"),
             (("--device", "cpu"), "is for agents in JAX"),
-            (("--seed", "-1"), "seed=-1"),
             (("--set", "state_dim=x"), "state_dim='x'"),
             (("--set", "complexty=3"), "Did you mean 'complexity'"),
-            (("--set", "learning_rat=3"), "Did you mean 'learning_rate'"),
             (("--hyperparameters", "none.json"), "none.json"),
-            (("--protocol", "papr-v1"), "Did you mean"),
-            (("--checkpoint-every", "0"), "checkpoint_every=0"),
         ],
     )
     def test_bad_input_writes_nothing(self, options, message, tmp_path):

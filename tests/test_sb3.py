@@ -21,8 +21,7 @@ from sme_registry.errors import (
 
 pytest.importorskip("stable_baselines3")
 
-from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
@@ -87,27 +86,6 @@ def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec, action_range):
         if spec is DRIVEN:
             env.set_options({"distractors": np.full(5, 0.5)})
     assert_same(ours.reset(), theirs.reset())
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "kwargs"),
-    [
-        (PPO, {"n_steps": 32, "batch_size": 32, "n_epochs": 1}),
-        (SAC, {"learning_starts": 20, "batch_size": 16, "buffer_size": 500}),
-    ],
-    ids=lambda value: getattr(value, "__name__", ""),
-)
-def test_sb3s_algorithms_learn_on_it(algorithm, kwargs):
-    env = VecMonitor(SMEVecEnv("Default", 4, horizon=10, k=5))
-    model = algorithm("MlpPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [16]},
-                      **kwargs)  # fmt: skip
-    evaluated = EvalCallback(VecMonitor(SMEVecEnv("Default", 2, horizon=10)), n_eval_episodes=2,
-                             eval_freq=20, verbose=0)  # fmt: skip
-    model.learn(128, callback=evaluated)
-    assert model.num_timesteps >= 128
-    assert all(episode["l"] == 10 for episode in model.ep_info_buffer)
-    assert len(model.ep_info_buffer) >= 12
-    assert np.isfinite(evaluated.last_mean_reward)
 
 
 def test_sb3s_wrappers_and_its_evaluation_work_on_it():

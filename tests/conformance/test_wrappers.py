@@ -16,28 +16,17 @@ LOW, HIGH = np.float32(-1.0), np.float32(1.0)
 AROUND_SINGLES = {
     name: getattr(wrappers, name)
     for name in (
-        "Autoreset", "ClipAction", "FlattenObservation", "NormalizeObservation", "NormalizeReward",
-        "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "TimeAwareObservation",
+        "Autoreset", "NormalizeObservation", "NormalizeReward", "PassiveEnvChecker",
+        "RecordEpisodeStatistics", "TimeAwareObservation",
     )
 } | {
-    "ClipReward": lambda env: wrappers.ClipReward(env, 0.0, 1.0),
-    "DelayObservation": lambda env: wrappers.DelayObservation(env, 1),
     "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
     "RescaleAction": lambda env: wrappers.RescaleAction(env, LOW, HIGH),
-    "RescaleObservation": lambda env: wrappers.RescaleObservation(env, LOW, HIGH),
-    "StickyAction": lambda env: wrappers.StickyAction(env, 0.2),
-    "TimeLimit": lambda env: wrappers.TimeLimit(env, T),
-    "TransformAction": lambda env: wrappers.TransformAction(env, np.sqrt, env.action_space),
-    "TransformReward": lambda env: wrappers.TransformReward(env, lambda reward: 2.0 * reward),
 }  # fmt: skip
 AROUND_BATCHES = {
-    "ClipAction": vector_wrappers.ClipAction,
-    "FlattenObservation": vector_wrappers.FlattenObservation,
     "NormalizeObservation": vector_wrappers.NormalizeObservation,
-    "NormalizeReward": vector_wrappers.NormalizeReward,
     "RecordEpisodeStatistics": vector_wrappers.RecordEpisodeStatistics,
     "RescaleAction": lambda env: vector_wrappers.RescaleAction(env, LOW, HIGH),
-    "TransformReward": lambda env: vector_wrappers.TransformReward(env, lambda reward: -reward),
     "DictInfoToList": vector_wrappers.DictInfoToList,
 }
 

@@ -78,15 +78,6 @@ def test_with_final_observations_each_timeout_has_its_successor(fragile):
     assert not given["rewards"][added].any()
 
 
-def test_d3rlpy_gets_copies(fragile):
-    for final_observations in (False, True):
-        given = to_d3rlpy(fragile, final_observations=final_observations)
-        before = fragile.digest
-        for array in given.values():
-            array[:] = -1.0
-        assert fragile.digest == before
-
-
 def scored(acting=((0.5, 1.0),), transitions=2_000, **fields):
     spec = SMESpec.from_dict(fields)
     behaviours = tuple(parse_behaviour(what, weight) for what, weight in acting)
@@ -118,20 +109,6 @@ def test_the_optimums_return_has_what_is_paid_on_top():
     assert optimum.similarity == pytest.approx(1.0, abs=1e-6)
     scores, _, _ = scored(transitions=100, safety={"tightness": 0.4, "compensated": True})
     assert scores.optimum.rollouts.mean_return > 110
-
-
-@pytest.mark.parametrize("fields", [{}, {"k": 7, "r_min": 0.3, "D": 0.2}, {"complexity": 10}])
-def test_the_optimums_return_is_the_horizon(fields):
-    scores, _, task = scored(transitions=100, **fields)
-    assert scores.optimum.rollouts.mean_return == 100.0
-    env = sme_registry.make(task.spec)
-    env.reset(seed=0)
-    total, ended = 0.0, False
-    while not ended:
-        optimal = task.optimal_action(env.unwrapped.state)
-        _, reward, terminated, truncated, _ = env.step(optimal)
-        total, ended = total + reward, terminated or truncated
-    assert total == pytest.approx(100.0, abs=1e-9)
 
 
 def test_the_returns_are_those_of_single_environments():

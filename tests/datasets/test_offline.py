@@ -123,16 +123,6 @@ def by_hand(result, evaluation):
     return np.array(similarities), np.array(rewards)
 
 
-def test_bc_imitates_the_optimum():
-    optimal = transitions_of(nu=0.0, count=2000)
-    result = short(
-        optimal, steps=400, batch_size=128, hyperparameters={"hidden": [64], "learning_rate": 0.01}
-    )
-    assert result.record.behaviour.similarity == pytest.approx(1.0, abs=1e-7)  # float32 actions
-    assert result.record.similarity > 0.95
-    assert result.report.regions[0].similarity > 0.95
-
-
 def test_iql_surpasses_random_behaviour():
     noisy = transitions_of(nu="random", count=2000)
     result = short(
@@ -258,25 +248,11 @@ def test_train_and_evaluate_from_the_command_line(folder, tmp_path, algorithm, m
     assert json.loads(shown.stdout)["policy"] == "policy"
 
 
-def test_json_is_the_record_and_the_report(folder, tmp_path):
-    shown = good(
-        "train", "--data", folder / "tiny-v0", "-a", "bc", "--json", "--out", tmp_path / "run",
-        *SHORT,
-    )  # fmt: skip
-    output = json.loads(shown.stdout)
-    assert output["run"]["algorithm"] == "bc"
-    assert output["run"]["hyperparameters"]["hidden"] == [8]
-    assert len(output["evaluation"]["regions"]) == 6
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["tiny-v1"], "is neither the id of a data set"),
-        (["tiny-v0", "-a", "ddpg"], "algorithm='ddpg'"),
-        (["tiny-v0", "--steps", "0"], "steps=0"),
         (["tiny-v0", "--set", "expectil=1"], "unknown field"),
-        (["tiny-v0", "--protocol", "nothing"], "nothing"),
         (["tiny-v0", "--resume"], "--resume: is not for --data"),
     ],
 )

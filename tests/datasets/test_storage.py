@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-from contextlib import nullcontext
 from pathlib import Path
 
 import h5py
@@ -125,17 +124,6 @@ class TestReading:
         assert dataset.transitions().terminations.any()
         assert all(episode.truncations.all() for episode in dataset.minari())
 
-    def test_the_record_has_provenance_and_digests(self, root):
-        record = open_dataset(NAME, root).record
-        assert record.recipe.transitions == 250
-        assert record.spec_digest == sme_registry.load("Default").digest
-        assert record.protocol_digest == record.recipe.protocol.digest
-        assert record.seeds.data == 7
-        assert record.seeds.task == 0
-        assert record.nu is None
-        assert record.trajectories == 4
-        assert {"sme_registry", "numpy", "h5py", "minari"} <= set(record.versions)
-
     def test_a_set_is_opened_by_its_id_and_by_any_of_its_paths(self, root, minaris):
         opened = [
             open_dataset(NAME),
@@ -164,18 +152,6 @@ class TestReading:
             np.testing.assert_array_equal(episode.truncations, transitions.timeouts[rows])
             first += len(episode)
         assert first == 250
-
-    def test_minari_can_sample_filter_split_and_combine(self, copied, monkeypatch):
-        monkeypatch.setenv("MINARI_DATASETS_PATH", str(copied))
-        loaded = minari.load_dataset(NAME)
-        assert len(loaded.sample_episodes(2)) == 2
-        short = loaded.filter_episodes(lambda episode: len(episode) < 100)
-        assert short.total_steps == 50
-        parts = minari.split_dataset(loaded, [1, 3])
-        assert sum(part.total_episodes for part in parts) == 4
-        assert minari.combine_datasets([loaded, loaded], "tests-both-v0").total_steps == 500
-        score = minari.get_normalized_score(loaded, np.array([loaded[0].rewards.sum()]))
-        assert 0.3 < float(score[0]) < 1.0
 
     def test_the_environment_is_recovered_in_a_fresh_process_that_knows_no_id(self, root):
         script = """
@@ -283,14 +259,6 @@ class TestAnExistingSet:
         folders = [child.name for child in (copied / "sme").iterdir() if child.is_dir()]
         assert folders == ["tests-v0"]
 
-    def test_of_a_function_is_compared_by_its_name(self, tmp_path):
-        def act(observations):
-            return observations[:, :4]
-
-        for words in ("", "with the same recipe"):
-            with pytest.raises(NameTakenError, match=words) if words else nullcontext():
-                make_dataset("Default", mix=[(act, 1.0)], transitions=10, folder=tmp_path)
-
     @pytest.mark.parametrize("foreign", ["empty", "minari's", "a file"])
     def test_of_another_package_is_never_replaced(self, foreign, tmp_path):
         place = tmp_path / NAME
@@ -355,11 +323,6 @@ class TestAWriterThatFails:
         assert "Traceback" not in done.stderr
         assert visible(tmp_path) == set()
         assert not [path for path in tmp_path.rglob("*") if path.suffix == ".hdf5"]
-
-    def test_a_folder_that_cannot_be_created_is_an_option_error(self, tmp_path):
-        (tmp_path / "file").write_text("")
-        with pytest.raises(OptionError, match="cannot be written"):
-            make_dataset("Default", transitions=10, folder=tmp_path / "file" / "sets")
 
 
 class TestAChangedSet:

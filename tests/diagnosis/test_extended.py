@@ -72,30 +72,12 @@ def test_violations_are_judged_by_what_they_earn(policy, answer, reason):
         assert verdict.evidence["gain"] > 0.01
 
 
-def test_the_optimum_violates_limits_in_the_share_of_the_tightness_and_earns_by_it():
-    diagnosis = diagnosis_of("optimal", EXTENDED)
-    assert answers(diagnosis) == ["yes", "no", "no", "no"]
-    found = diagnosis.verdict("constraint_violation").evidence
-    assert found["violating_entries"] == pytest.approx(0.2, abs=0.04)
-    assert found["cost"] == found["optimal_cost"]
-    assert found["gain"] == pytest.approx(found["price_of_safety"])
-    assert found["safe_regret"] == pytest.approx(-found["price_of_safety"])
-    assert "Near the optimum without limits" in diagnosis.headline()
-
-
 def test_the_regret_of_the_safe_optimum_is_the_price_of_safety_and_a_constant_has_no_fault():
     diagnosis = diagnosis_of("safe_projection", EXTENDED)
     assert answers(diagnosis) == ["no", "yes", "no", "no"]
     found = diagnosis.verdict("price_of_safety").evidence
     assert found["price_of_safety"] == pytest.approx(found["regret"])
     assert answers(diagnosis_of("constant", EXTENDED)) == ["no"] * 4
-
-
-def test_a_constant_that_violates_costs_as_much_where_it_goes_as_in_uniform_states():
-    # The transition keeps the uniform distribution under a constant action.
-    limits = diagnosis_of(upper_bound_below(np.inf), EXTENDED).measurements.limits
-    assert limits.visited.cost == pytest.approx(limits.report.regions[0].cost, rel=0.1)
-    assert limits.visited.violating_share == pytest.approx(1.0, abs=0.01)
 
 
 def test_the_channel_that_violates_is_named_and_costs_add_up():

@@ -198,19 +198,6 @@ def test_a_failure_that_is_hardly_worse_than_a_fresh_agent_s_is_not_blamed_on_th
     assert found.verdict("failure_to_learn").reason == "failed_as_fresh_agents"
 
 
-def test_forgetting_of_a_phase_that_was_never_learnt_is_said_to_be_that():
-    def away(observations):  # good in phase 1, and worse in phase 0 than before
-        best = SECOND(observations)
-        return np.clip(best + 0.15 * (best - FIRST(observations)), 0.0, 1.0)
-
-    found = diagnosis_of(report_of([HALF, SECOND, away], THREE))
-    assert [phase.outcome for phase in found.phases] == ["not_learnt", "retained", "not_learnt"]
-    assert found.forgetting > 0.0
-    assert answer(found, "forgetting") == ("no", "phases_retained")
-    assert "(mean over earlier phases, learnt or not)" in found.headline()
-    assert "earlier phases, learnt or not" in found.verdict("forgetting").sentence()
-
-
 def test_the_visit_whose_regret_stands_out_is_named():
     life, fresh = [FIRST, SECOND] * 2, [FIRST, SECOND]
 

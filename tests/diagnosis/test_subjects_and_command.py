@@ -3,8 +3,6 @@
 import importlib.util
 import json
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -170,12 +168,3 @@ def test_without_matplotlib_there_is_a_page_without_figures(tmp_path, monkeypatc
     result = good("diagnose", "constant", "--task", "Default", *SHORT, "--out", tmp_path)
     assert "pip install" in result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["diagnosis.json", "diagnosis.md"]
-
-
-def test_importing_the_diagnosis_imports_neither_torch_nor_matplotlib():
-    code = (
-        "import sys, sme_registry.diagnosis.figures; "
-        "print([m for m in ('torch', 'matplotlib', 'stable_baselines3') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

@@ -7,10 +7,10 @@ import pytest
 
 from sme_registry import SMESpec, evaluate, load
 from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, load_run
-from sme_registry.diagnosis.measure import LINEAR, POLICY
+from sme_registry.diagnosis.measure import POLICY
 from sme_registry.diagnosis.subject import load_cell
 from sme_registry.diagnosis.task import TEAM_QUESTIONS, TeamDiagnosis
-from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies import run_study
@@ -146,25 +146,6 @@ def test_an_agent_with_a_harder_optimum_is_distinguished(one_fails):
     assert regrets[0] < regrets[1]
 
 
-@pytest.mark.parametrize(
-    ("updates", "learnt", "answer"),
-    [(20, 0.79, "yes"), (19, 0.79, "cannot tell"), (None, 0.8, "cannot tell")],
-)
-def test_a_harder_optimum_is_a_cause_only_of_a_team_that_has_learnt(
-    one_fails, updates, learnt, answer
-):
-    *others, driver = one_fails.agents
-    linear = driver.measurements.uniform[LINEAR].model_copy(update={"normalised_regret": 0.9})
-    uniform = {**driver.measurements.uniform, LINEAR: linear}
-    measurements = driver.measurements.model_copy(update={"uniform": uniform})
-    agents = [*others, driver.model_copy(update={"measurements": measurements})]
-    visited = one_fails.visited.model_copy(update={"normalised_regret": learnt})
-    fields = {"agents": agents, "visited": visited, "updates": updates}
-    verdict = one_fails.model_copy(update=fields).judged(TEAM_QUESTIONS).verdict("harder_optimum")
-    assert verdict.answer == answer
-    assert "optimal policy is harder to learn." in verdict.sentence()
-
-
 def test_an_agent_that_fails_only_where_the_team_takes_it():
     policies = with_optimal()
 
@@ -194,13 +175,6 @@ def test_the_regret_of_a_shared_reward_is_attributed_to_each_agents_own_actions(
     assert max(scores["scout_0"].regret, scores["driver_0"].regret) < 1e-6  # float32 states
     assert scores["driver_1"].regret > 0.5
     assert "sparsity" in diagnosis.left_out
-
-
-def test_comparisons_and_probes_are_refused_for_teams():
-    subject = load_policy(with_optimal(), SPEC)
-    for options in ({"against": subject}, {"probe_capacity": True}):
-        with pytest.raises(OptionError, match="single agents on one task only"):
-            diagnose(subject, **options)
 
 
 def test_a_cell_of_a_study_of_teams_is_diagnosed(tmp_path):

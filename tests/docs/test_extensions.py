@@ -2,7 +2,6 @@
 
 import importlib
 import inspect
-import json
 import re
 
 import pytest
@@ -13,7 +12,6 @@ pytest.importorskip("sphinx")
 
 import command_reference
 import docstrings
-import links
 import python_reference
 import schema_files
 from sphinx.util.inspect import signature as inspect_signature
@@ -22,41 +20,6 @@ from sphinx.util.inspect import stringify_signature
 import sme_registry
 from sme_registry import seasons
 from sme_registry.cli.show import _SCHEMAS
-
-
-def test_links_out_of_docs_lead_to_pages_of_the_site_or_nowhere():
-    def rewritten(text):
-        return links.rewrite(text, "guides", ROOT / "docs")
-
-    assert (
-        rewritten("[c](../../CONTRIBUTING.md#checks)") == "[c](../project/contributing.md#checks)"
-    )
-    assert rewritten("[board](../../examples/board)") == "board"
-    same = "[ope](../../examples/ope.py), ![x](../../x.png), [m](../explanation/method.md)"
-    assert rewritten(same) == same
-    assert rewritten("[teams.md](teams.md#a) says") == "[](teams.md#a) says"
-
-
-def test_a_notebook_has_links_of_the_site_and_one_to_its_file():
-    link = "[i](../../README.md#install) [m](../explanation/method.md)"
-    cells = [
-        {"cell_type": "markdown", "source": ["# Title\n", link]},
-        {"cell_type": "code", "source": link},
-    ]
-    text = json.dumps({"cells": cells})
-    page = json.loads(links.rewrite_notebook(text, "tutorials/a", ROOT / "docs"))
-    assert [cell["source"] for cell in page["cells"]] == [
-        "# Title\n[i](../index.md#install) [m](../explanation/method.md)\n\n"
-        "{download}`Download this page as a notebook <a.ipynb>`",
-        link,
-    ]
-
-
-def test_the_front_page_is_the_readme_with_its_links_from_docs():
-    text = "[m](docs/m.md#a) ![f](docs/f.png) [c](CITATION.cff) [p](https://a.org) [i](#install)"
-    assert links.front(text) == (
-        "[m](m.md#a) ![f](f.png) [c](../CITATION.cff) [p](https://a.org) [i](#install)"
-    )
 
 
 def test_a_docstring_becomes_rst_with_its_formulas_and_doctests_untouched():

@@ -94,19 +94,6 @@ def test_an_optimal_action_is_drawn_on_its_mark_without_any_regret_between():
         assert rendering._REGRET in colours(env.render()[90:260, rendering.WIDTH // 2 :])
 
 
-def test_the_numbers_shown_are_those_of_the_episode():
-    env = begun("Default", k=4, horizon=10)
-    earned, paid = 0.0, []
-    for _ in range(10):
-        _, reward, _, _, info = env.step(np.full(4, 0.5, np.float32))
-        earned += info["step_reward"]
-        paid.append(reward)
-        renderer = env._renderer
-        assert renderer._payout == pytest.approx(reward, abs=1e-9)
-        assert renderer._earned - renderer._pending == pytest.approx(sum(paid), abs=1e-9)
-    assert renderer._regrets[-1] == pytest.approx(10 - earned)
-
-
 def test_what_is_recorded_is_drawn_later_whatever_is_written_into_what_step_returned(monkeypatch):
     drawn = []
     draw = rendering.Renderer._draw

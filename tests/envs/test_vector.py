@@ -1,7 +1,6 @@
 """`SMEVectorEnv`: resets of some lanes, autoreset modes, and what is refused."""
 
 import copy
-import functools
 import pickle
 
 import gymnasium
@@ -163,29 +162,6 @@ def test_options_and_seeds_that_cannot_be_used_are_refused_and_no_lane_moves():
     again = env.reset(seed=40, options={"reset_mask": one})[0]
     np.testing.assert_array_equal(again[[0, 2]], first[[0, 2]])
     np.testing.assert_array_equal(again[1], SMEEnv("Plane1").reset(seed=41)[0])
-
-
-def test_both_back_ends_step_singles_and_batches_through_the_same_states(monkeypatch):
-    pytest.importorskip("numba")
-    for name in ("Default", "HardFragile", "StateDim64", "ActionDim16"):
-        for lanes in (0, 37):
-            envs = []
-            for backend in ("numba", "numpy"):
-                monkeypatch.setenv("SME_BACKEND", backend)
-                make = functools.partial(SMEVectorEnv, num_envs=lanes) if lanes else SMEEnv
-                envs.append(make(name, k=3, horizon=25, D=0.0))
-                envs[-1].reset(seed=0)
-            rng, (fast, plain) = np.random.default_rng(0), envs
-            for _ in range(25):
-                optimal = plain.task.optimal_action(plain.state)
-                action = (0.7 * optimal + 0.3 * rng.random(optimal.shape)).astype(np.float32)
-                got, expected = fast.step(action), plain.step(action)
-                np.testing.assert_array_equal(fast.state, plain.state)
-                np.testing.assert_allclose(got[0], expected[0], rtol=0, atol=1e-7)
-                np.testing.assert_allclose(got[1], expected[1], rtol=0, atol=3e-12)
-                np.testing.assert_array_equal(got[2:4], expected[2:4])
-                for key in ("optimal_action", "similarity", "step_reward", "regret"):
-                    np.testing.assert_allclose(got[4][key], expected[4][key], rtol=0, atol=3e-12)
 
 
 @pytest.mark.parametrize("mode", MODES)

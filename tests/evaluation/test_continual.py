@@ -29,9 +29,8 @@ from sme_registry.evaluation import (
 )
 from sme_registry.evaluation.dynamic_regret import RegretBlocks
 from sme_registry.evaluation.report import as_text
-from sme_registry.evaluation.retention import METRICS, Retention, final_specs, stream_regrets
-from sme_registry.spec import EvaluationProtocol, StreamSpec
-from sme_registry.task import loading
+from sme_registry.evaluation.retention import final_specs
+from sme_registry.spec import StreamSpec
 from tests.evaluation.streams import SPEC, TWICE, half, network, stream_of
 
 PROTOCOL = {"states_per_region": 300, "epsilons": [0.5, 1.0]}
@@ -50,15 +49,6 @@ def report(seed=0):
 
 
 # Retention
-
-
-def test_retention_draws_each_task_once_even_if_it_is_too_large_to_keep(monkeypatch):
-    drawn = []
-    draw = loading._draw
-    monkeypatch.setattr(loading, "_CACHED_BYTES", 0)
-    monkeypatch.setattr(loading, "_draw", lambda spec: drawn.append(spec) or draw(spec))
-    stream_regrets(THREE, [], EvaluationProtocol(**PROTOCOL))
-    assert drawn == list(final_specs(THREE))
 
 
 def test_the_matrix_has_the_normalised_regret_of_an_evaluation_on_each_phases_task():
@@ -200,11 +190,6 @@ def test_what_cannot_be_compared_is_none():
     assert only.final("plasticity_ratio") is only.final("plasticity_difference") is None
 
 
-def test_one_mapping_names_every_metric_of_a_retention():
-    regrets = {"normalised_regret", "initial_normalised_regret", "fresh_normalised_regret"}
-    assert [*METRICS] == [name for name in Retention.model_fields if name not in regrets]
-
-
 # Dynamic regret
 
 
@@ -263,25 +248,6 @@ def played(stream, more):
     return *map(np.array, zip(*rows, strict=True)), ends
 
 
-@pytest.mark.parametrize("switch", ["episode", "step"])
-def test_the_log_of_an_environment_gives_the_regret_of_each_visit(switch):
-    specs = [SPEC.derive(seed=i, D=0.1) for i in range(3)]
-    stream = stream_of(*specs, cycles=2, steps=33, switch=switch)
-    lifetime, regret, phase, ends = played(stream, 20)
-    log = dynamic_regret(stream, lifetime, regret, phase=phase)
-    assert log.steps == stream.steps + 20
-    assert log.dynamic_regret == pytest.approx(sum(regret))
-    visits = np.cumsum(np.diff(phase, prepend=phase[0]) != 0)
-    found = [visit.dynamic_regret for visit in log.visits]
-    np.testing.assert_allclose(found, np.bincount(visits, regret))
-    lengths = np.diff(ends, prepend=0)
-    assert len(set(lengths)) > 1
-    if switch == "episode":
-        means = [part.mean() for part in np.split(regret, ends)[: len(ends)]]
-        of_episodes = dynamic_regret(stream, ends, means, lengths).visits
-        np.testing.assert_allclose([v.dynamic_regret for v in of_episodes][:-1], found[:-1])
-
-
 def test_an_episode_in_two_visits_is_divided_in_proportion():
     stream = stream_of(SPEC, SPEC.derive(seed=1), steps=10, switch="step")
     divided = dynamic_regret(stream, [8, 12], [0.5, 1.0], [8, 4])
@@ -326,8 +292,6 @@ def test_learning_transfer_needs_a_visit_that_is_over_and_regret_of_a_fresh_agen
     ("online", "message"),
     [
         ([0.5], "fresh online_regret=.*must be 2 numbers, one for each phase"),
-        (0.3, "fresh online_regret=0.3: must be 2 numbers, one for each phase"),
-        (None, "fresh online_regret=None: must be 2 numbers"),
         ([0.5, 1.5], r"fresh online_regret=\[0.5, 1.5\]: must be in \[0, 1\]"),
         ([0.5, float("nan")], "fresh online_regret: has NaN"),
     ],

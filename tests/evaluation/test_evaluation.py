@@ -7,7 +7,7 @@ import pytest
 
 import sme_registry
 from sme_registry import evaluate, materialize
-from sme_registry.errors import MalformedDocumentError, SpecError, UnknownNameError
+from sme_registry.errors import SpecError
 from sme_registry.evaluation import references, regions
 from sme_registry.evaluation.evaluate import evaluation_observations
 from sme_registry.spec import EvaluationProtocol, ProtocolFile
@@ -19,7 +19,6 @@ from tests.evaluation.kinds import (
     WIDTHS,
     half,
     linear,
-    numbers,
     observations,
     optimal_of,
     report_of,
@@ -114,13 +113,6 @@ def test_references_stand_in_their_known_order_and_have_every_region(report):
         assert all(row.clipped_share == 0.0 for row in rows)
 
 
-def test_the_fit_sees_as_many_states_whatever_the_batches(monkeypatch):
-    monkeypatch.setattr(references, "FIT_STATES", 1_500)
-    expected = numbers(evaluate(linear, PLAIN, PROTOCOL))
-    monkeypatch.setattr(regions, "BATCH_ROWS", 400)
-    assert numbers(evaluate(linear, PLAIN, PROTOCOL)) == pytest.approx(expected, abs=1e-11)
-
-
 def test_progress_runs_from_the_first_batch_to_all_states(monkeypatch):
     monkeypatch.setattr(regions, "BATCH_ROWS", 1_000)
     seen = []
@@ -138,16 +130,3 @@ def test_the_default_protocol_is_the_papers():
     default = inspect.signature(evaluate).parameters["protocol"].default
     paper = sme_registry.evaluation.resolve_protocol(default)
     assert paper == EvaluationProtocol(states_per_region=50_000, epsilons=(0.2, 0.4, 0.6, 0.8, 1.0))
-
-
-@pytest.mark.parametrize(
-    ("protocol", "error", "message"),
-    [
-        ("papper-v1", UnknownNameError, "Did you mean 'paper-v1'"),
-        ("nowhere/protocol.json", MalformedDocumentError, "cannot be read"),
-        (7, SpecError, "must be a protocol, its name or its path"),
-    ],
-)
-def test_an_unknown_protocol_is_refused(protocol, error, message):
-    with pytest.raises(error, match=message):
-        evaluate(half(3), PLAIN, protocol)

@@ -11,7 +11,7 @@ import pytest
 
 import sme_registry
 from sme_registry import SMESpec, load, make_parallel, materialize
-from sme_registry.errors import ActionError, SpecError
+from sme_registry.errors import ActionError
 from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
@@ -137,21 +137,6 @@ def test_an_episode_has_the_scores_of_a_single_environment(spec):
     assert (per_step != pytest.approx(found.regret.mean())) == (spec is HARD)
 
 
-@both_tasks
-def test_the_scores_are_those_of_evaluate_policy(spec, trained):
-    def act(observations):
-        # Row by row, as SB3 asks: these tasks double a difference in an action's last bit at each
-        # step, and a batch of another size has other last bits.
-        rows = [trained.predict(row[None], deterministic=True)[0] for row in observations]
-        return (np.concatenate(rows).astype(np.float64) + 1.0) / 2.0
-
-    states = start_states(0, 0, 3, 3)
-    found = rollouts(act, materialize(spec), states)
-    returns, lengths = evaluated_by_sb3(trained, spec, states)
-    np.testing.assert_allclose(found.episode_return, returns, rtol=0, atol=1e-5)
-    np.testing.assert_array_equal(found.length, lengths)
-
-
 def test_the_copied_actor_has_the_scores_of_evaluate_policy_until_chaos_parts_them(trained):
     brief, states = PLAIN.derive(horizon=6), start_states(0, 1, 20, 3)
     fast = numpy_policy(trained, PLAIN)
@@ -184,12 +169,6 @@ def test_start_states_are_new_at_each_evaluation_and_the_same_when_asked_again()
 def test_what_cannot_be_rolled_out_is_refused(policy, message):
     with pytest.raises(ActionError, match=message):
         rollouts(policy, materialize(PLAIN), start_states(0, 0, 2, 3))
-
-
-def test_one_policy_for_a_team_is_refused():
-    team = PLAIN.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
-    with pytest.raises(SpecError, match="for 2 agents"):
-        rollouts(nearly_optimal(PLAIN), materialize(team), start_states(0, 0, 2, 3))
 
 
 def shown(spec, states, seed=0):

@@ -183,18 +183,6 @@ def test_arrays_come_back_with_their_types_and_shapes_all_or_some(tmp_path):
         read_arrays(path, ["header"])
 
 
-def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):
-    path = tmp_path / "state.npz"
-    write_arrays(path, ARRAYS)
-    before = path.read_bytes()
-    with pytest.raises(OptionError, match="cannot be written: Is a directory"):
-        write_arrays(tmp_path, ARRAYS)
-    with pytest.raises(OptionError, match="cannot be written"):
-        write_arrays(path / "below.npz", ARRAYS)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.parametrize("damage", ["missing", "cut short", "no archive", "code", "one array"])
 def test_what_is_no_file_of_such_arrays_is_refused(tmp_path, damage):
     path = tmp_path / "state.npz"

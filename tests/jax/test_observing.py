@@ -147,14 +147,6 @@ def test_distractors_of_starts_and_noise_are_uniform_and_new():
     assert abs(np.corrcoef(columns.T) - np.eye(12)).max() < 5 / np.sqrt(4096)
 
 
-def test_a_task_without_both_carries_nothing_of_them():
-    params = task_params(SMESpec())
-    state = jax.eval_shape(env.reset, jax.random.key(0), params)[1]
-    assert len(jax.tree.leaves(state)) == 3
-    assert len(jax.tree.leaves(params)) == 10
-    assert functions.random_numbers(jax.random.key(0), params) == (None, None)
-
-
 def test_an_episode_begins_with_any_distractors():
     spec = two_tasks({"distractors": M})[0]
     params = task_params(spec)

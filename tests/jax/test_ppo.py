@@ -265,19 +265,6 @@ def test_a_program_collects_whole_rollouts_and_learns_between_them():
     assert not agents.failed().any()
 
 
-def test_a_program_goes_on_from_saved_state_bit_for_bit():
-    agents = program()
-    agents.advance(64)
-    again = program()
-    again.restore(agents.save())
-    one, other = agents.advance(96), again.advance(96)
-    for mine, theirs in zip(one, other, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
-    agents.finish()
-    again.finish()
-    assert largest_difference(agents.weights(1), again.weights(1)) == 0.0
-
-
 def test_a_failed_run_leaves_the_others_alone():
     agents, broken = program(), program()
     weights = dict(broken.state.weights)

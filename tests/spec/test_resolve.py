@@ -3,7 +3,6 @@
 import importlib
 import inspect
 import pkgutil
-import pydoc
 import re
 import shutil
 from typing import Annotated
@@ -186,14 +185,6 @@ def test_every_field_is_described_in_help_and_schema_with_one_text(kind):
         shown = re.search(rf"^  {name}: ((?:.|\n    )*)", kind.__doc__, re.M)
         assert shown, name
         assert " ".join(shown[1].split()) == field.description, name
-
-
-def test_help_shows_symbol_and_meaning_of_inherited_fields_too():
-    text = pydoc.render_doc(SMESpec, renderer=pydoc.plaintext)
-    flat = " ".join(re.sub(r"^ \|", "", text, flags=re.M).split())
-    assert "state_dim: S, state channels. " in flat
-    assert "seed: of all random draws of the task." in flat
-    assert "team: divides the action channels" in flat
 
 
 def test_a_document_has_one_text_a_field_and_a_summary_without_them():

@@ -5,7 +5,6 @@ import hashlib
 import json
 import pickle
 import re
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from sme_registry.spec import (
     SuiteClass,
     TeamSpec,
 )
-from tests.strategies import SEEDS, THRESHOLDS, spec_fields, specs
+from tests.strategies import spec_fields, specs
 
 # One other valid value for every field of a single-agent spec.
 CHANGED = {
@@ -59,19 +58,6 @@ def test_specs_are_equal_exactly_where_their_digests_are(one, other):
     assert {one: "found"}[SMESpec.from_dict(one.to_dict())] == "found"
     with pytest.raises(ValidationError, match="frozen"):
         one.k = 2
-
-
-@given(spec_fields(plain=True), st.data())
-def test_a_spec_differs_from_itself_with_any_one_field_changed(fields, data):
-    spec = SMESpec.from_dict(fields)
-    field = data.draw(st.sampled_from(["k", "r_min", "D", "complexity", "horizon", "seed"]))
-    value = data.draw(
-        {"seed": SEEDS, "r_min": THRESHOLDS, "D": THRESHOLDS}.get(field, st.integers(1, 10))
-    )
-    derived = spec.derive(**{field: value})
-    same = getattr(derived, field) == getattr(spec, field)
-    assert (derived.digest == spec.digest) is same
-    assert (derived == spec) is same
 
 
 def test_every_field_but_the_version_of_the_schema_is_part_of_the_digest():
@@ -217,11 +203,6 @@ class TestSuites:
 
 VECTORS = Path(__file__).parent / "rfc8785"
 NAMES = sorted(path.stem for path in (VECTORS / "input").glob("*.json"))
-NUMBERS = [line.split() for line in (VECTORS / "numbers.txt").read_text().splitlines()]
-
-
-def number(bits):
-    return struct.unpack(">d", bytes.fromhex(bits))[0]
 
 
 def test_published_documents_have_their_published_canonical_bytes():
@@ -230,21 +211,6 @@ def test_published_documents_have_their_published_canonical_bytes():
         given = (VECTORS / "input" / f"{name}.json").read_bytes()
         expected = (VECTORS / "output" / f"{name}.json").read_bytes()
         assert rfc8785.dumps(parse_json(given)) == expected
-
-
-def test_the_example_in_the_standard_has_its_printed_bytes():
-    given = parse_json((VECTORS / "sample.json").read_bytes())
-    assert rfc8785.dumps(given) == bytes.fromhex((VECTORS / "sample.hex").read_text())
-
-
-def test_published_numbers_have_their_published_form():
-    assert len(NUMBERS) == 26
-    for bits, text in NUMBERS:
-        if text == "error":  # not finite
-            with pytest.raises(rfc8785.FloatDomainError):
-                rfc8785.dumps(number(bits))
-        else:
-            assert rfc8785.dumps(number(bits)) == text.encode()
 
 
 def test_the_digest_is_the_hash_of_every_field_in_canonical_form():

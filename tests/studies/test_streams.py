@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from leaderboard.cli import app as leaderboard
 from sme_registry import SMESpec, StreamSpec, load, save
 from sme_registry.errors import SpecError
-from sme_registry.spec import StreamFile, StudyFile, StudyPlan, Suite, SuiteFile, catalogue
+from sme_registry.spec import StreamFile, StudyFile, StudyPlan, SuiteFile, catalogue
 from sme_registry.spec.study import Cell
 from sme_registry.studies.budget import uneven_rollouts
 from tests import commands
@@ -198,21 +198,6 @@ def test_leaderboards_refuse_streams():
     result = CliRunner().invoke(leaderboard, ["init", "board", "--suite", "lives.json"])
     assert result.exit_code == 2, result.output
     assert "suite: has streams (mine)" in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"draws": [0, 0]}, r"streams.0.draws=\[0, 0\]: must be distinct"),
-        ({"draw": [1]}, "streams.0.draw=.*unknown field. Did you mean 'draws'"),
-        ({"name": "default"}, "the name 'default' appears twice"),
-    ],
-)
-def test_a_wrong_class_of_streams_is_named(change, message):
-    classes = [{"name": "default", "setting": {}, "seeds": [0]}]
-    member = {"name": "s", "stream": "Switch5", **change}
-    with pytest.raises(SpecError, match=message):
-        Suite.from_dict({"classes": classes, "streams": [member]})
 
 
 def test_a_plan_with_a_life_of_more_visits_than_are_evaluated_is_refused():

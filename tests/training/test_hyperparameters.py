@@ -2,11 +2,10 @@
 
 import pytest
 
-from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.errors import OptionError
 from sme_registry.training.algorithms import (
     check_hyperparameters,
     nested_hyperparameters,
-    read_hyperparameters,
 )
 
 pytest.importorskip("stable_baselines3")
@@ -31,15 +30,6 @@ def test_names_that_cannot_be_nested_are_rejected(flat):
         nested_hyperparameters(flat)
 
 
-def test_a_file_holds_an_object(tmp_path):
-    path = tmp_path / "settings.json"
-    path.write_text('{"policy_kwargs.net_arch": [8], "gamma": 0.5}')
-    assert read_hyperparameters(path) == {"policy_kwargs": {"net_arch": [8]}, "gamma": 0.5}
-    path.write_text("[1]")
-    with pytest.raises(OptionError, match="must be an object"):
-        read_hyperparameters(path)
-
-
 @pytest.mark.parametrize(
     ("uses", "values", "message"),
     [
@@ -60,22 +50,3 @@ def test_a_field_of_the_task_may_have_been_meant():
     for uses in ("jax:TD3", "TD3"):
         with pytest.raises(OptionError, match=rf"{uses} has no .*Did you mean 'complexity'"):
             check_hyperparameters(uses, {"complexty": 2}, others=others)
-
-
-def test_known_names_are_accepted_whatever_their_values():
-    check_hyperparameters("PPO", {"n_steps": "many", "policy_kwargs": {"net_arch": [8]}})
-    check_hyperparameters("sb3_contrib:RecurrentPPO", {"policy_kwargs": {"lstm_hidden_size": 8}})
-    with pytest.raises(UnknownNameError):
-        check_hyperparameters("TD4", {"gamma": 0.9})
-
-
-def test_json_values_become_those_of_a_constructor():
-    from torch import nn
-
-    from sme_registry.training.models import resolved
-
-    values = {"train_freq": [1, "episode"], "policy_kwargs": {"activation_fn": "torch.nn:ELU"}}
-    assert resolved(values) == {
-        "train_freq": (1, "episode"),
-        "policy_kwargs": {"activation_fn": nn.ELU},
-    }

@@ -97,19 +97,6 @@ def test_a_team_is_evaluated_by_the_policy_its_agents_share(team_run):
     }  # fmt: skip
 
 
-def test_training_lowers_the_regret_of_each_agent(tmp_path):
-    spec = SMESpec.from_dict(
-        {"state_dim": 1, "action_dim": 2, "horizon": 25, "seed": 2,
-         "team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}}
-    )  # fmt: skip
-    settings = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 0.003}
-    result = train(spec, algorithm="TD3", steps=225, folder=tmp_path / "run", protocol=PROTOCOL,
-                   hyperparameters=settings, progress=False)  # fmt: skip
-    assert result.record.num_envs == 1
-    regrets = np.array([episode.agents_regret for episode in result.episodes])
-    assert (regrets[-2:].mean(axis=0) < 0.7 * regrets[:2].mean(axis=0)).all()
-
-
 def test_a_teams_run_resumes_with_its_columns(team_run, tmp_path):
     folder = tmp_path / "run"
     copy_files(team_run.folder, folder)

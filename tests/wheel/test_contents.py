@@ -129,27 +129,3 @@ def test_workflows_pin_actions_by_commit_and_may_write_nothing(name):
     for action in used:
         assert re.fullmatch(r"[\w./-]+@[0-9a-f]{40}", action), action
     assert yaml.safe_load(text)["permissions"] == {"contents": "read"}
-
-
-def test_issue_forms_have_what_github_requires():
-    every = in_clone(".github/ISSUE_TEMPLATE").glob("*.yml")
-    forms = [path for path in every if path.stem != "config"]
-    assert len(forms) == 2
-    for path in forms:
-        form = yaml.safe_load(path.read_text())
-        assert {"name", "description", "body"} <= form.keys()
-        assert all(part["attributes"]["label"] for part in form["body"])
-        ids = [part["id"] for part in form["body"]]
-        assert len(set(ids)) == len(ids)
-
-
-def test_the_changelog_keeps_to_its_form():
-    lines = (ROOT / "CHANGELOG.md").read_text().splitlines()
-    versions = [line for line in lines if line.startswith("## ")]
-    assert versions[0] == "## [Unreleased]"
-    for line in versions[1:]:
-        assert re.fullmatch(r"## \[\d+\.\d+\.\d+\] - \d{4}-\d\d-\d\d", line), line
-    kinds = {line[4:] for line in lines if line.startswith("### ")}
-    assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
-    first = next(i for i, line in enumerate(lines) if line.startswith("- "))
-    assert any(line.startswith("### ") for line in lines[:first])

@@ -14,14 +14,12 @@ from sme_registry.errors import (
     OptionError,
     PolicyError,
     SpecError,
-    UnknownNameError,
 )
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.spec.study import Cell
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.result import CellResult
 from sme_registry.task import materialize
-from sme_registry.training.algorithms import find
 
 SPEC = SMESpec(state_dim=2, action_dim=2, horizon=20)
 
@@ -205,19 +203,16 @@ def test_a_reference_is_judged_as_often_as_a_learner_would_be():
     assert constant.report.regions[0].normalised_regret == pytest.approx(1.0)
 
 
-def test_episodes_may_end_early():
-    result = run_cell(cell("reference:constant", spec=SPEC.derive(D=0.2), evaluation_episodes=50))
-    assert all(1 <= length < 20 for length in result.curve.length)
-
-
 def test_what_cannot_be_run_is_refused():
     team = SPEC.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
     with pytest.raises(SpecError, match="uses='offline:bc': learns a task of a single agent, and"):
         run_cell(cell("offline:bc", spec=team))
     with pytest.raises(OptionError, match="degree: reference:linear has no such hyperparameter"):
         run_cell(cell("reference:linear", hyperparameters={"degree": 2}))
-    with pytest.raises(UnknownNameError, match="Did you mean 'linear'"):
-        run_cell(cell("reference:liner"))
+    with pytest.raises(OptionError, match=r"nu=1.5: must be in \[0, 1\]"):
+        run_cell(offline(nu=1.5))
+    with pytest.raises(SpecError, match="D"):
+        run_cell(offline(spec=SMESpec(state_dim=2, action_dim=1, D=0.1)))
 
 
 def test_without_sb3_a_reference_runs_and_a_learner_says_what_to_install(monkeypatch):
@@ -289,14 +284,3 @@ def test_more_noise_makes_worse_data_and_other_cells():
     assert noisy.key != clean.key
     assert clean.offline.behaviour_similarity == pytest.approx(1.0)
     assert noisy.offline.behaviour_similarity < 0.97
-
-
-def test_bad_cells_are_refused_in_words():
-    spec = SMESpec(state_dim=2, action_dim=1)
-    find("jax:PPO").check_task(spec.derive(safety={"tightness": 0.2}))
-    with pytest.raises(UnknownNameError, match="offline:iql"):
-        run_cell(offline("offline:iq"))
-    with pytest.raises(OptionError, match=r"nu=1.5: must be in \[0, 1\]"):
-        run_cell(offline(nu=1.5))
-    with pytest.raises(SpecError, match="D"):
-        run_cell(offline(spec=SMESpec(state_dim=2, action_dim=1, D=0.1)))

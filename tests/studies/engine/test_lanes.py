@@ -278,23 +278,14 @@ def test_a_program_with_other_lanes_leaves_a_state_whole(whole, study, state, mo
     assert not list((study / "states").glob("*.npz"))
 
 
-def test_a_state_of_other_versions_is_not_used(whole, study, state):
-    def worsen(arrays):
-        arrays["records/regret"] += 1000.0  # would show in the results
-
-    change_state(state, worsen, versions={"jax": "0"})
-    assert ran(study).count("done") == 4
-    assert numbers(study).items() <= numbers(whole).items()
-
-
-@pytest.mark.parametrize("name", ["records/regret", "program/.key"])
-def test_a_state_with_other_arrays_counts_as_none(name, whole, study, state):
+@pytest.mark.parametrize("other", ["versions", "program/.key"])
+def test_a_state_of_other_versions_or_with_other_arrays_counts_as_none(other, whole, study, state):
     def change(arrays):
-        assert arrays.pop(name) is not None
-        if name != "records/regret":
-            arrays[name] = np.zeros(3)
+        arrays["records/regret"] += 1000.0  # would show in the results
+        if other != "versions":
+            arrays[other] = np.zeros(3)
 
-    change_state(state, change)
+    change_state(state, change, **({"versions": {"jax": "0"}} if other == "versions" else {}))
     steps = list[int]()
     status = ran(study, on_steps=steps.append)
     assert status.count("done") == 4

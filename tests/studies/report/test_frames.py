@@ -87,14 +87,6 @@ def test_every_metric_is_a_column_of_its_frame(loaded):
     assert {m.key for m in metrics_of("run") if not m.needs} <= set(frames.runs_of(loaded.results))
 
 
-def test_the_public_names_load_on_first_use():
-    for name in studies.__all__:
-        assert getattr(studies, name).__name__ == name
-    assert set(studies.__all__) <= set(dir(studies))
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = studies.nothing
-
-
 def test_only_results_need_pandas():
     script = (
         "import sys; sys.modules['pandas'] = None\n"
@@ -126,14 +118,6 @@ def test_the_difference_is_that_of_runs_with_one_instance_and_seed(loaded):
     assert found.difference == pytest.approx(float(iqm(both.Alpha - both.Beta)))
     assert found.first_level == pytest.approx(float(iqm(both.Alpha)))
     assert found.low < found.difference < found.high < 0
-
-
-def test_all_classes_is_the_mean_of_the_classes(loaded):
-    table = studies.compare(loaded, "Alpha", "Beta", ["ood_regret"])
-    classes = table[table.class_name != ALL]
-    total = row(table, ALL, "ood_regret")
-    assert total.difference == pytest.approx(classes.difference.mean())
-    assert total.pairs == classes.pairs.sum() == 23
 
 
 def test_the_difference_the_other_way_round_is_its_mirror_image(loaded):

@@ -244,7 +244,7 @@ def test_algorithms_on_classes_without_any_run_are_not_missing(finished, tmp_pat
     assert "15 of 20 runs have finished. The plan has 55 more" in text  # one on k-25 has failed
 
 
-def test_by_default_a_report_is_a_page_a_figure_and_a_table(finished, tmp_path):
+def test_by_default_a_report_is_a_page_a_figure_and_a_table(finished, tmp_path, drawn):
     files = write_report(finished, tmp_path, ("html", "png", "csv", "latex"))
     names = ["index.html", "figure.png", "table.csv", "table.tex"]
     assert [path.relative_to(tmp_path).as_posix() for path in files] == names
