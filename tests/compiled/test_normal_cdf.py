@@ -48,13 +48,6 @@ def test_beyond_the_table_it_is_zero_or_one_and_a_half_for_tiny_arguments():
     assert (phi(np.array([0.0, -0.0, 5e-324, -5e-324, -1e-300, 1e-17])) == 0.5).all()
 
 
-def test_its_values_stay_in_the_unit_interval_and_never_fall_by_more_than_rounding():
-    x = np.sort(np.random.default_rng(1).uniform(-9.0, 9.0, 200_000))
-    y = phi(x)
-    assert ((y >= 0.0) & (y <= 1.0)).all()
-    assert np.diff(y).min() > -BOUND
-
-
 SPEC = SMESpec(k=3, r_min=0.1, complexity=3)
 
 

@@ -2,19 +2,17 @@
 
 import io
 import re
-import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from sme_registry.spec import EnvFile, StreamFile, catalogue
-from sme_registry.statistics import iqm
 from tests.docs.conftest import ROOT
 
 pytest.importorskip("matplotlib")
 
-from _gallery import measured, pictures, results
+from _gallery import measured, pictures
 
 PAGES = sorted((ROOT / "docs" / "reference" / "generated").glob("catalogue-*.md"))
 FOLDER = ROOT / "docs" / "reference" / "gallery"
@@ -84,46 +82,3 @@ def test_a_pixel_of_a_picture_is_the_optimal_action_there():
     for row, column in ((20, 30), (81, 75), (140, 90)):
         a = task.policy(np.array([[side[column], side[row]]]))[0, 0]
         assert abs(image[row, column] - a * 16) <= 1.1
-
-
-def test_drawing_and_measuring_write_nothing_where_nothing_is_missing(
-    tmp_path, monkeypatch, capsys
-):
-    folder, file = tmp_path / "gallery", tmp_path / "measured.json"
-    shutil.copytree(FOLDER, folder)
-    shutil.copy(measured.FILE, file)
-    monkeypatch.setattr(measured, "FILE", file)
-    before = {path: path.stat().st_mtime_ns for path in [file, *folder.iterdir()]}
-    pictures.draw(folder)
-    measured.measured()
-    assert {path: path.stat().st_mtime_ns for path in [file, *folder.iterdir()]} == before
-    assert capsys.readouterr().out == ""
-
-
-def test_a_missing_picture_is_drawn_and_one_of_no_entry_is_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "names", lambda: {"ActionDim1-v1": "ActionDim1-v1.png"})
-    (tmp_path / "Gone-v1.png").write_bytes(b"")
-    pictures.draw(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["ActionDim1-v1.png"]
-
-
-def test_results_are_those_of_the_same_setting():
-    levels = results.levels()
-
-    def of(name):
-        return levels.get(results.setting_of(ENTRIES[name].spec), [])
-
-    assert [(each.algorithm, each.steps, len(each.cube)) for each in of("Default")] == [
-        ("PPO", 20_000, 2), ("TD3", 20_000, 2), ("SAC", 20_000, 2), ("PPO", 100_000, 10),
-    ]  # fmt: skip
-    # As docs/results/ablations.md has them.
-    assert np.mean(of("Complexity50")[-1].cube) == pytest.approx(0.923, abs=5e-4)
-    plane = {each.algorithm: float(iqm(each.shells)) for each in of("Plane10")}
-    assert plane == pytest.approx({"TD3": 0.411, "PPO": 0.673, "SAC": 0.229}, abs=5e-4)
-    safe = {each.algorithm: np.mean(each.cube) for each in of("Safety20")}
-    assert safe.keys() == {"PPO", "TD3", "SAC"}  # none of those that learn to respect limits
-    assert len(of("MixedNonlinear3")[0].cube) == 3
-    assert of("HardDeep") == of("Team4") == of("Safety05") == []
-    lives = {life.algorithm: life for life in results.lives()["Switch5"]}
-    assert lives["PPO"].lives == 3
-    assert lives["PPO"].metrics["forgetting"][0] == pytest.approx(0.26, abs=5e-3)

@@ -94,23 +94,6 @@ def test_an_optimal_action_is_drawn_on_its_mark_without_any_regret_between():
         assert rendering._REGRET in colours(env.render()[90:260, rendering.WIDTH // 2 :])
 
 
-def test_what_is_recorded_is_drawn_later_whatever_is_written_into_what_step_returned(monkeypatch):
-    drawn = []
-    draw = rendering.Renderer._draw
-    monkeypatch.setattr(
-        rendering.Renderer, "_draw", lambda self, surface: drawn.append(draw(self, surface))
-    )
-    env, untouched = begun(), begun()
-    action = np.full(4, 0.5, np.float32)
-    info = env.step(action)[4]
-    untouched.step(action.copy())
-    info["optimal_action"][:] = 0.0
-    action[:] = 1.0
-    assert drawn == []
-    np.testing.assert_array_equal(env.render(), untouched.render())
-    assert len(drawn) == 2
-
-
 def test_frames_need_no_display_print_nothing_and_leave_the_process_alone():
     done = run(
         "import os, sme_registry\n"

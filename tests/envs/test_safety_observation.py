@@ -5,7 +5,7 @@ import copy
 import gymnasium
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from sme_registry import SMESpec, StreamSpec
@@ -85,6 +85,8 @@ def test_a_batch_of_any_size_is_its_singles(name, backend):
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(spec=specs(team=False), seed=st.integers(0, 99))
+@example(spec=SMESpec(complexity=50, state_dim=5, action_dim=3), seed=0)
+@example(spec=SMESpec(state_dim=33, action_dim=17, hidden_width=70, complexity=3), seed=0)
 def test_a_step_of_any_spec_is_the_definitions_single_and_in_a_batch(spec, seed, backend):
     env, batch = SMEEnv(spec), SMEVectorEnv(spec, 3)
     task, rng = env.task, np.random.default_rng(seed)
@@ -98,6 +100,10 @@ def test_a_step_of_any_spec_is_the_definitions_single_and_in_a_batch(spec, seed,
         np.testing.assert_array_equal(env.state, task.transition(s, action[0], noise[1:]))
         np.testing.assert_allclose(info["optimal_action"], task.optimal_action(s), atol=1e-12)
         assert info["similarity"] == pytest.approx(task.similarity(s, action[0]), abs=1e-12)
+        assert info["regret"] == 1.0 - info["step_reward"]
+        if spec.r_min == 0.0:
+            earned = task.step_reward(s, action[0].astype(np.float64))
+            assert info["step_reward"] == pytest.approx(earned, abs=1e-11)
         np.testing.assert_allclose(
             observation[:-2], task.seen(env.state, env.distractors), rtol=0, atol=2e-7
         )

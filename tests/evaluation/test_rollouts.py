@@ -12,11 +12,9 @@ import pytest
 import sme_registry
 from sme_registry import SMESpec, load, make_parallel, materialize
 from sme_registry.errors import ActionError
-from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.training.algorithms import one_thread
-from sme_registry.training.numpy_policy import numpy_policy
 
 PLAIN = SMESpec(state_dim=3, action_dim=2)
 # Payouts every 7 steps, a threshold, and an end at the first bad step.
@@ -68,16 +66,6 @@ def evaluated_by_sb3(model, spec, states):
         warnings.simplefilter("ignore")
         scores = evaluate_policy(model, env, len(states), return_episode_rewards=True)
     return np.array(scores[0]), np.array(scores[1])
-
-
-@pytest.fixture(scope="module", params=["PPO", "TD3"])
-def trained(request):
-    sb3 = pytest.importorskip("stable_baselines3")
-    from sme_registry.sb3 import SMEVecEnv
-
-    settings = {"TD3": {"buffer_size": 500}, "PPO": {"n_steps": 128}}[request.param]
-    algorithm = getattr(sb3, request.param)
-    return algorithm("MlpPolicy", SMEVecEnv(PLAIN), seed=1, device="cpu", **settings).learn(150)
 
 
 def test_a_recurrent_model_keeps_its_state_during_an_episode():
@@ -137,22 +125,6 @@ def test_an_episode_has_the_scores_of_a_single_environment(spec):
     assert (per_step != pytest.approx(found.regret.mean())) == (spec is HARD)
 
 
-def test_the_copied_actor_has_the_scores_of_evaluate_policy_until_chaos_parts_them(trained):
-    brief, states = PLAIN.derive(horizon=6), start_states(0, 1, 20, 3)
-    fast = numpy_policy(trained, PLAIN)
-    assert isinstance(fast.act, Perceptron)
-    found = rollouts(fast, materialize(brief), states)
-    returns, _ = evaluated_by_sb3(trained, brief, states)
-    np.testing.assert_allclose(found.episode_return, returns, rtol=0, atol=1e-5)
-    # And over whole episodes, which are others then, on average: within 4 standard errors.
-    states, task = start_states(0, 2, 500, 3), materialize(PLAIN)
-    ours = rollouts(fast, task, states).episode_return
-    own = rollouts(as_policy(trained, PLAIN), task, states).episode_return
-    assert np.abs(ours - own).max() > 1e-3
-    error = np.sqrt((ours.var() + own.var()) / len(states))
-    assert abs(ours.mean() - own.mean()) < 4 * error
-
-
 def test_start_states_are_new_at_each_evaluation_and_the_same_when_asked_again():
     first = start_states(3, 0, 5, 8)
     assert first.shape == (5, 8)
@@ -186,14 +158,6 @@ def shown(spec, states, seed=0):
 def test_a_policy_may_keep_what_it_observed():
     times = shown(PLAIN, start_states(0, 0, 2, 3))[:, 0, 3]
     np.testing.assert_allclose(times, np.arange(100) / 100, atol=1e-6)
-
-
-def test_limits_change_no_return():
-    limited = HARD.derive(D=0.0, safety={"tightness": 0.2})
-    act, states = nearly_optimal(limited), start_states(0, 0, 5, 3)
-    plain = rollouts(act, materialize(limited.derive(safety=None)), states)
-    for one, other in zip(rollouts(act, materialize(limited), states), plain, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_distractors_depend_on_the_state_of_the_start_and_the_seed():

@@ -83,15 +83,6 @@ def test_a_log_stays_short_however_long_the_job_takes(clock, hours, most):
     assert max(steps) <= max(120, 0.11 * seconds)  # no long silence
 
 
-def test_a_job_that_stands_still_prints_ever_less(clock):
-    text = io.StringIO()
-    with Progress("study", 9, console=Console(file=text, width=200)) as progress:
-        for second in range(0, 100_000, 10):
-            clock.now = float(second)
-            progress.update(1)
-    assert len(text.getvalue().splitlines()) <= 15
-
-
 def test_running_parts_are_named_in_a_line(clock):
     text = io.StringIO()
     console = Console(file=text, width=200)

@@ -122,36 +122,6 @@ def test_evaluations_are_of_the_task_on_which_their_step_was_taken():
     assert [program.lives.at(lifetime).k[0] for lifetime in (4, 5, 9, 10, 23)] == [1, 3, 3, 1, 3]
 
 
-@pytest.mark.parametrize(
-    ("rollout", "updates"),
-    [(1, [5, 10, 15, 20]), (2, [2, 5, 7, 10]), (5, [1, 2, 3, 4]), (8, [0, 1, 1, 3])],
-)
-def test_a_visit_ends_after_the_update_of_the_last_rollout_in_it(rollout, updates):
-    program = Scripted(budget=20, rollout=rollout, specs=[stream(0), stream(1)])
-    ended = []
-    due = [5, 20]
-
-    def on_visit(visit, weights):
-        assert [each["bias"].shape for each in weights] == [(1,), (1,)]
-        ended.append((visit, program.updates))
-
-    rows = scripted_run(program, due, on_visit=on_visit)
-    assert ended == [*enumerate(updates)]
-    assert rows[0][2] == 4 // rollout  # before the update that ends the visit
-    plain = Scripted(budget=20, rollout=rollout)
-    scripted_run(plain, due, on_visit=on_visit)
-    assert len(ended) == 4
-
-
-def test_a_restored_run_goes_on_after_the_visits_that_have_ended():
-    program, ended = Scripted(budget=20, specs=[stream(0), stream(1)]), list[int]()
-    program.steps = 10
-    scripted_run(program, [], on_visit=lambda visit, _: ended.append(visit))
-    assert ended == [2, 3]
-    scripted_run(program, [], on_visit=lambda visit, _: ended.append(visit))
-    assert ended == [2, 3, 3]  # saved after its last step: the last visit ends with the training
-
-
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_actor_of_each_algorithm_is_all_that_acts(name):
     _, program = ALGORITHMS[name]

@@ -10,10 +10,7 @@ from sme_registry.errors import OptionError, SpecError, WireError
 from sme_registry.seasons import Ticket
 from sme_registry.seasons.wire import (
     StepFormat,
-    StepsAnswer,
-    instance_path,
     pack_table,
-    table_bytes,
     unpack_table,
 )
 
@@ -42,42 +39,9 @@ def saved(array):
     return stream.getvalue()
 
 
-def test_an_address_has_the_season_the_ticket_and_the_instance():
-    path = instance_path("winter", 7, 3, "steps")
-    assert path == "/api/seasons/winter/tickets/7/instances/3/steps"
-
-
-def test_the_answer_to_start_arrives_and_has_one_size():
-    data = FORMAT.pack(2**40, random(LANES, S + 2))
-    number, observation = FORMAT.unpack_start(data)
-    assert number == 2**40
-    assert np.array_equal(observation, random(LANES, S + 2))
-    for other in (b"", data[:-4], data + bytes(4 * LANES)):
-        with pytest.raises(WireError, match="start: has"):
-            FORMAT.unpack_start(other)
-
-
 def test_the_bytes_of_a_request_are_little_endian():
     body = StepFormat(1, S, 1).pack(1, np.array([[0.5]]))
     assert body == b"\1\0\0\0\0\0\0\0\0\0\0\x3f"
-
-
-def steps(terminated, truncated):
-    return StepsAnswer(
-        random(LANES, S + 2), random(LANES), np.array(terminated), np.array(truncated),
-        random(LANES, S + 2)[::-1],
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("ends", [([True, False, True], [False, True, True]), ([False] * 3,) * 2])
-def test_steps_arrive_with_every_kind_of_end_in_one_size(ends):
-    sent = steps(*ends)
-    data = FORMAT.pack_steps(sent)
-    assert len(data) == FORMAT.answer_bytes == 4 * LANES * (2 * (S + 2) + 2)
-    for given, arrived in zip(sent, FORMAT.unpack_steps(data), strict=True):
-        assert np.array_equal(given, arrived)
-        assert given.dtype == arrived.dtype
-        assert arrived.flags.writeable
 
 
 def test_ends_that_do_not_exist_are_refused():
@@ -86,15 +50,6 @@ def test_ends_that_do_not_exist_are_refused():
         table[1, S + 3] = ends
         with pytest.raises(WireError, match="must be 0, 1, 2 or 3"):
             FORMAT.unpack_steps(table.tobytes())
-
-
-@pytest.mark.parametrize("rows", [0, 1, 1000, 123456])
-def test_a_table_is_the_file_that_numpy_reads_and_writes(rows):
-    table = random(rows, A)
-    assert np.array_equal(np.load(io.BytesIO(pack_table(table)), allow_pickle=False), table)
-    assert len(pack_table(table)) <= table_bytes(rows, A)
-    for data in (pack_table(table), saved(table)):
-        assert np.array_equal(unpack_table(data, A, rows), table)
 
 
 def other_header(shape):

@@ -1,9 +1,6 @@
 """The folder of a study: whole files, locks that end with their process, nothing misread."""
 
 import json
-import os
-import subprocess
-import sys
 
 import pytest
 
@@ -11,18 +8,10 @@ from sme_registry.errors import OptionError, SpecError
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.result import CellFailure
-from tests.studies.cells import small_file, wait_for
+from tests.studies.cells import small_file
 
 FILE = small_file()
 CELL, OTHER = (planned.cell for planned in FILE.plan.cells)
-
-HOLDER = """
-import sys, time
-from sme_registry.studies.ledger import Ledger
-lock = Ledger(sys.argv[1]).lock(sys.argv[2])
-print("holds" if lock else "not", flush=True)
-time.sleep(600)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -48,32 +37,6 @@ def test_a_result_is_read_back_as_it_was_and_ends_the_failure_before_it(tmp_path
     assert ledger.results() == ledger.results([OTHER.digest, CELL.digest]) == {CELL.digest: result}
     assert ledger.failures() == {}
     assert ledger.model_path(CELL.digest).read_bytes() == b"a model"
-
-
-def test_a_lock_is_had_once_until_it_is_released(tmp_path):
-    ledger, another = Ledger(tmp_path), Ledger(tmp_path)
-    assert not ledger.is_running(CELL.digest)
-    assert list(tmp_path.iterdir()) == []  # asking makes no file
-    lock = ledger.lock(CELL.digest)
-    assert lock is not None
-    assert another.lock(CELL.digest) is None
-    assert another.lock(OTHER.digest) is not None
-    assert another.is_running(CELL.digest)
-    lock.release()
-    assert not another.is_running(CELL.digest)
-    assert another.lock(CELL.digest) is not None
-
-
-def test_a_lock_ends_with_the_process_that_held_it_however_that_died(tmp_path):
-    command = [sys.executable, "-c", HOLDER, str(tmp_path), CELL.digest]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout.readline() == "holds\n"
-        assert Ledger(tmp_path).lock(CELL.digest) is None
-        assert Ledger(tmp_path).is_running(CELL.digest)
-        holder.kill()
-        holder.wait()
-    wait_for(lambda: not Ledger(tmp_path).is_running(CELL.digest))
-    assert Ledger(tmp_path).lock(CELL.digest) is not None
 
 
 @pytest.mark.parametrize("damage", ["half", "other", "not JSON", "edited"])
@@ -131,13 +94,3 @@ def test_a_plan_that_was_damaged_is_an_error_and_not_a_new_study(tmp_path):
     (tmp_path / "plan.json").write_text("{")
     with pytest.raises(SpecError, match="not JSON"):
         Ledger(tmp_path).plan_file()
-
-
-def test_a_folder_that_cannot_be_written_to_is_a_typed_error(tmp_path, result):
-    (tmp_path / "cells").touch()
-    (tmp_path / "locks").touch()
-    with pytest.raises(OptionError, match="cannot be written"):
-        Ledger(tmp_path).write(result)
-    with pytest.raises(OptionError, match="cannot be locked"):
-        Ledger(tmp_path).lock(CELL.digest)
-    assert sorted(os.listdir(tmp_path)) == ["cells", "locks"]

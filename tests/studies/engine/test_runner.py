@@ -432,15 +432,14 @@ def test_the_command_ends_with_1_where_a_cell_failed_and_lists_it(study, tmp_pat
     assert [failure["attempts"] for failure in printed["failures"]] == [2, 2]
 
 
-@pytest.mark.parametrize("executor", ["in-process", "processes"])
-def test_a_study_runs_without_posix_modules_and_signals(executor, tmp_path):
+def test_a_study_runs_without_posix_modules_and_signals(tmp_path):
     plan, study = tmp_path / "plan.json", tmp_path / "study"
     small_file(seeds=2).write(plan)
     script = tmp_path / "sme_without_posix.py"
     script.write_text(WITHOUT_POSIX + RUN)
     command = [sys.executable, str(script), "study", "run", str(plan), "-f", str(study)]
     process = subprocess.run(
-        [*command, "--executor", executor, "--jobs", "2"],
+        [*command, "--executor", "processes", "--jobs", "2"],
         capture_output=True,
         text=True,
         check=False,

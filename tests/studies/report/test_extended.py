@@ -2,7 +2,6 @@
 
 import re
 
-import pandas as pd
 import pytest
 
 from sme_registry.errors import UnknownNameError
@@ -12,7 +11,7 @@ from sme_registry.studies.cell import run_cell
 from sme_registry.studies.report import frames, texts
 from sme_registry.studies.report.design import metrics_of
 from sme_registry.studies.report.frames import study_frames
-from sme_registry.studies.report.tables import analyse, layers
+from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.report.write import compare
 from tests.studies.cells import small_file
 
@@ -101,22 +100,6 @@ def test_rows_have_the_numbers_of_their_reports(study):
     assert set(zip(trained.class_name, trained.algorithm, strict=True)) == {("safe", "constant")}
 
 
-def test_plans_without_limits_and_observations_have_no_such_columns(study):
-    columns = {}
-    for name in ("plain", "safe", "driven"):
-        file, results = only(study, name)
-        columns[name] = set(study_frames(file.plan, results).results)
-    assert columns["safe"] - columns["plain"] == {
-        "tightness", "compensated", "online_cost", "wd_cost", "wd_safe_regret", "cost",
-        "violating_share", "safe_regret", "price_of_safety",
-    }  # fmt: skip
-    assert columns["driven"] - columns["plain"] == {
-        "distractors", "dynamics", "mixing", "mixing_depth", "distractor_regret", "sensitivity",
-        "wd_sensitivity",
-    }  # fmt: skip
-    assert columns["plain"] <= columns["safe"] & columns["driven"]
-
-
 def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
     of_regret = {"wd_regret", "ood_regret", "ood_decay"}
     metrics = {
@@ -170,10 +153,3 @@ def test_tables_for_people_show_them_and_what_the_layers_keep(study, analysis):
     assert plain.parts[0].metrics == tuple(m for m in metrics_of("run") if not m.needs)
     assert "layers" not in texts.csv_tables(plain)
     assert "layers" not in {table.name for table in texts.text_tables(plain)}
-
-
-def test_what_layers_keep_is_the_iqm_over_runs():
-    probes = pd.DataFrame({"run": range(4), "state_r2": [0.2, -100.0, 0.6, 0.4]})
-    kept = layers(probes.assign(class_name="driven", algorithm="PPO", layer=0, distractor_r2=0.25))
-    assert kept.state_r2.tolist() == pytest.approx([0.3])
-    assert kept.runs.tolist() == [4]

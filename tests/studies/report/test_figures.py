@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report import figures
 from sme_registry.studies.report.figures import curves, draw_figures
-from sme_registry.studies.report.figures.panels import FEW, looks_of, positions, spacing
+from sme_registry.studies.report.figures.panels import FEW, looks_of
 from sme_registry.studies.report.tables import analyse
 from tests.geometry import assert_readable
 from tests.studies.report.test_report import FIGURES
@@ -76,26 +76,6 @@ def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysi
     assert any("colours from 0.90 to 1.00" in axes.get_xlabel() for axes in figure.axes)
 
 
-def test_curves_and_levels_near_1_have_headroom(analysis):
-    rows = analysis.tables["learning_curves"]
-    names = ["q25", "median", "q75"]
-    squeezed = rows.assign(**{name: 0.98 + 0.02 * (rows[name] % 1.0) for name in names})
-    squeezed.loc[squeezed.index[::3], "q75"] = 1.0
-    levels = analysis.tables["levels"].assign(iqm=0.999, linear=0.999, low=0.99, high=1.0)
-    unlearnt = with_tables(analysis, learning_curves=squeezed, levels=levels)
-    drawings = [curves.draw_class_curves, curves.draw_regret]
-    (picture, *levels), _ = figures.draw(drawings, unlearnt, ())
-    assert "each a running median over 2 evaluations" in picture.caption
-    ((low, high),) = {axes.get_ylim() for axes in picture.figure.axes if axes.get_visible()}
-    assert 0.9 < low < 0.98
-    assert high - 1.0 > 0.03 * (high - low)
-    assert len(levels) == 2
-    shown = [axes for level in levels for axes in level.figure.axes if axes.get_visible()]
-    for low, high in {axes.get_ylim() for axes in shown}:
-        assert low == 0.0
-        assert high - 1.0 > 0.03
-
-
 def test_a_figure_of_levels_shows_those_of_its_own_metric(analysis):
     levels = analysis.tables["levels"]
     pictures, _ = figures.draw([curves.draw_regret], analysis, ())
@@ -118,26 +98,6 @@ def test_an_axis_with_a_single_class_has_no_figure(finished):
     two = analysed(finished, lambda planned: planned.class_name not in ("default", "k-25"))
     pictures, _ = figures.draw([curves.draw_learning_curves], two, ())
     assert [picture.name for picture in pictures] == ["learning-curves-k"]
-
-
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        ([1, 2, 5, 10], "log"),
-        ([0, 0.1, 1], "linear"),
-        ([1, 10], "linear"),
-        (["individual", "team"], "nominal"),
-        ([], "nominal"),
-    ],
-)
-def test_an_axis_has_the_scale_on_which_its_values_are_evenly_spaced(values, expected):
-    assert spacing(values) == expected
-
-
-def test_classes_have_equal_distances_on_their_scale():
-    assert np.allclose(positions([1, 2, 4, 8], 4), np.log([1, 2, 4, 8]))
-    assert list(positions([0.25, 0.5, 0.75], 3)) == [0.25, 0.5, 0.75]
-    assert list(positions(["a", "b"], 2)) == [0.0, 1.0]
 
 
 def test_a_method_has_one_colour_in_every_figure_and_a_legend_explains_hollow_marks(analysis):

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
@@ -85,23 +83,6 @@ def test_every_metric_is_a_column_of_its_frame(loaded):
     for kind, table in (("life", lives.lives), ("visit", lives.visits), ("data", loaded.results)):
         assert {metric.key for metric in metrics_of(kind)} <= set(table)
     assert {m.key for m in metrics_of("run") if not m.needs} <= set(frames.runs_of(loaded.results))
-
-
-def test_only_results_need_pandas():
-    script = (
-        "import sys; sys.modules['pandas'] = None\n"
-        "from sme_registry import studies\n"
-        "from sme_registry.errors import MissingDependencyError\n"
-        "studies.run_study, studies.study_status\n"
-        "try:\n"
-        "    studies.load\n"
-        "except MissingDependencyError as error:\n"
-        "    print(error)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120
-    )
-    assert "[studies]" in done.stdout
 
 
 def row(table, class_name, metric="wd_regret"):

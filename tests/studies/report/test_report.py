@@ -3,7 +3,6 @@
 import csv
 import re
 import shutil
-import subprocess
 from html.parser import HTMLParser
 
 import numpy as np
@@ -17,7 +16,6 @@ from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.frames import records
-from sme_registry.studies.report.texts import TextTable
 from tests.commands import good, refused
 
 pytest.importorskip("matplotlib")
@@ -249,35 +247,3 @@ def test_by_default_a_report_is_a_page_a_figure_and_a_table(finished, tmp_path, 
     names = ["index.html", "figure.png", "table.csv", "table.tex"]
     assert [path.relative_to(tmp_path).as_posix() for path in files] == names
     assert set(pd.read_csv(files[2]).algorithm) == {"Alpha", "Beta", "constant"}
-
-
-NAMES = [
-    "PPO", "SAC", "learning rate 0.0001 with a name that goes on",
-    "ProximalPolicyOptimizationWithClippingAndManyOtherThings", "TD3 (symmetric)", "TD3 (unit)",
-    "B.9+c-(d)", "constant ½",
-]  # fmt: skip
-CLASSES = ["default", "a-very-long-class-name-with_under_scores-and-k-25-r_min-0_5", "all classes"]
-ENTRY = "+0.123 [−0.456, +0.789] (n = 3)"
-
-
-def latex(algorithms, classes=3):
-    frame = pd.DataFrame({"class": [CLASSES[i % 3] for i in range(classes)]})
-    for name in NAMES[:algorithms]:
-        frame[name] = ENTRY
-    caption = "Difference of WD regret. IQM over pairs, 95 % interval. *: worse, †: better."
-    title, _, note = caption.partition(". ")
-    return TextTable(f"t{algorithms}-{classes}", title, note, frame).latex()
-
-
-@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
-def test_pdflatex_finds_no_overfull_box(tmp_path):
-    tables = "\n".join(latex(n, 6) + "\\clearpage" for n in (1, 2, 3, 8))
-    packages = "\\usepackage{booktabs,graphicx}"
-    document = f"\\documentclass[twocolumn]{{article}}{packages}\\begin{{document}}\n{tables}"
-    (tmp_path / "paper.tex").write_text(document + "\n\\end{document}\n", encoding="ascii")
-    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
-    log = (tmp_path / "paper.log").read_text(encoding="latin-1")
-    assert done.returncode == 0, log
-    assert "Overfull" not in log
-    assert "too large" not in log
