@@ -32,6 +32,7 @@ from sme_registry.diagnosis.figures import draw
 from sme_registry.diagnosis.subject import load_cell
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport
+from sme_registry.evaluation.evaluate import acts_below_range
 from sme_registry.evaluation.policies import TeamPolicy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import check_new, integer_in, write_atomically
@@ -48,7 +49,6 @@ from sme_registry.spec import (
 )
 from sme_registry.task import load
 
-_CLIPPED = 0.2  # the share of actions above which their range is doubted
 _EVALUATION = "evaluation.json"
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
 _POLICY_FILES = (".zip", ".onnx", ".npz")
@@ -138,8 +138,8 @@ def evaluate(
         policy = evaluation.as_policy(policies[0], document, **options)
         with _progress(resolved) as progress:
             report = evaluation.evaluate(policy, document, resolved, progress=progress.update_of)
-        clipped = report.regions[0].clipped_share
-        if action_range is None and report.action_range == "unit" and clipped > _CLIPPED:
+        if action_range is None and acts_below_range(policy, report):
+            clipped = report.regions[0].clipped_share
             print_note(
                 f"{clipped:.0%} of the actions in WD are outside [0, 1] and were clipped. If the "
                 "policy's actions are in [−1, 1], add --action-range symmetric."

@@ -142,10 +142,14 @@ class RangeWarning:
         self._is_over = True
         symmetric = f"{NAMESPACE}/{symmetric_name(unique_name(self._document))}"
         id_too = f', or make "{symmetric}"' if symmetric in gymnasium.registry else ""
-        gymnasium.logger.warn(
-            f"actions below 0 are clipped to 0, as the action range is [0, 1]. If your actor's are "
-            f'in [-1, 1], such as those of tanh, use action_range="symmetric"{id_too}.'
-        )
+        warn_of_clipping(id_too)
+
+
+def warn_of_clipping(id_too: str = "") -> None:
+    gymnasium.logger.warn(
+        "actions below 0 are clipped to 0, as the action range is [0, 1]. If your actor's are in "
+        f'[-1, 1], such as those of tanh, use action_range="symmetric"{id_too}.'
+    )
 
 
 def from_unit(unit: npt.NDArray[Any], rescaled: bool) -> npt.NDArray[Any]:

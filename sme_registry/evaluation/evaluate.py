@@ -60,6 +60,8 @@ OnBatch = Callable[[int, int], None]
 Subject = tuple[Policy | TeamPolicy, SMESpec]
 """A policy and its task."""
 
+_MANY, _FEW_STATES = 0.2, 1000
+
 Key = int | str
 """The index of a policy, or the name of a reference."""
 
@@ -94,7 +96,21 @@ def evaluate(
     [report] = evaluate_many([(prepared, spec)], protocol, progress=progress)
     if isinstance(report, PolicyError):
         raise report
+    if action_range is None and policy is not prepared and acts_below_range(prepared, report):
+        arguments.warn_of_clipping()
     return report
+
+
+def acts_below_range(policy: Policy | TeamPolicy, report: EvaluationReport) -> bool:
+    """Whether over 20 % of the entries of actions in WD are clipped at 0, as those of tanh are."""
+    clipped = report.regions[0].clipped_share
+    if isinstance(policy, TeamPolicy) or report.action_range != "unit" or clipped <= _MANY:
+        return False
+    few = EvaluationProtocol(states_per_region=_FEW_STATES)
+    drawn = next(iter(states(few, 0, report.spec)))
+    seen = drawn.seen(materialize(report.spec))
+    actions = policy.start()(drawn.observation(seen, report.spec.horizon))
+    return float((actions < 0.0).mean()) > _MANY
 
 
 def evaluate_many(

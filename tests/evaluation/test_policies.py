@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+import warnings
 import zipfile
 
 import numpy as np
@@ -468,3 +469,16 @@ def test_a_function_of_tensors_is_told_that_observations_are_arrays():
     actor = torch_actor(torch)
     with pytest.raises(PolicyError, match=r"NumPy arrays: `torch\.as_tensor\(observations\)`"):
         evaluated(lambda o: actor(o))
+
+
+@pytest.mark.parametrize(
+    ("level", "action_range", "warned"), [(-0.5, None, 1), (-0.5, "unit", 0), (1.5, None, 0)]
+)
+def test_a_policy_whose_actions_are_mostly_below_0_is_warned_of_once(level, action_range, warned):
+    def act(observations):
+        return np.full((len(observations), 4), level)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sme_registry.evaluate(act, "Default", "quick-v1", action_range=action_range)
+    assert ["symmetric" in str(warning.message) for warning in caught] == [True] * warned
