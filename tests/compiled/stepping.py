@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from sme_registry.task.task import BUFFER_STATE, BUFFER_VALUES, COST, REWARD
+
 
 @dataclass
 class Result:
@@ -22,6 +24,28 @@ class Result:
     accumulated_reward: Any
     terminated: Any
     truncated: Any
+
+
+class Lane:
+    """One lane of a single agent: an episode stepped by an engine's single-lane entry points."""
+
+    def __init__(self, task, engine, state, t=0, r_cum=0.0):
+        self.task, self.engine = task, engine
+        self.buffer, self.numbers = engine.new_buffer()
+        self.numbers[BUFFER_STATE : BUFFER_STATE + len(state)] = state
+
+    def step(self, action):
+        """One step with a float32 or float64 action; None where it was refused."""
+        A, S = self.task.spec.action_dim, self.task.spec.state_dim
+        optimal, observation = np.empty(A), np.empty(S + 2, np.float32)
+        entry = self.engine.step_one(action.dtype)
+        reward, end = entry(self.buffer, action, optimal, observation)
+        if end < 0:
+            return None
+        state = self.numbers[BUFFER_STATE : BUFFER_STATE + S].copy()
+        values = self.numbers[BUFFER_VALUES : BUFFER_VALUES + COST].tolist()
+        assert values[REWARD] == reward
+        return Result(state, observation, optimal, *values, end in (1.0, 3.0), end >= 2.0)
 
 
 def step_batch(task, engine, states, t, r_cum, actions):
