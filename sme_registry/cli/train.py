@@ -125,7 +125,8 @@ class Settings:
     protocol: Annotated[
         str | None,
         typer.Option(
-            help="Evaluation protocol; default paper-v1, of --data the data set's.",
+            help="Evaluation protocol; default paper-v1, below 20,000 steps quick-v1, of --data "
+            "the data set's.",
             autocompletion=catalogue.completion(ProtocolFile),
         ),
     ] = None
@@ -244,11 +245,16 @@ def _train_task(options: Settings, task: str) -> None:
         "the same command with --resume",
         algorithm=uses,
         hyperparameters=settings,
-        protocol=options.protocol or "paper-v1",
+        protocol=options.protocol,
         **{name: getattr(options, name) for name in _PASSED_ON},
     )
     if result.record.stream is None:
         _write_explorer(folder)
+    if options.protocol is None and result.record.steps < DEFAULT_STEPS:
+        print_note(
+            f"Evaluated with quick-v1, since the training has fewer than {DEFAULT_STEPS:,} steps. "
+            "Use --protocol paper-v1 for the full evaluation."
+        )
     print_training(result, folder, json=options.json)
 
 
@@ -435,6 +441,7 @@ def demo(
         out_folder,
         f"`sme train Default-v1 --steps {steps} --out {out_folder} --resume`",
         steps=steps,
+        protocol="paper-v1",
         hyperparameters={} if full else _SETTINGS,
         force=force or out_folder == DEMO_FOLDER,
     )

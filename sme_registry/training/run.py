@@ -131,7 +131,7 @@ def train(
     action_range: ActionRange = "symmetric",
     num_envs: int | None = None,
     checkpoint_every: int | None = None,
-    protocol: ProtocolLike = "paper-v1",
+    protocol: ProtocolLike | None = None,
     progress: bool = True,
     console: Console | None = None,
     resume: bool = False,
@@ -168,6 +168,8 @@ def train(
         team and an on-policy algorithm. 1 on a stream and in JAX.
       checkpoint_every: steps between checkpoints; None takes a twentieth of `steps`, at least
         1,000.
+      protocol: of the final evaluation; None takes "paper-v1", and "quick-v1" below 20,000 steps,
+        after which it would take longer than the training.
       resume: continue the unfinished run in the folder; `steps` may be larger than before.
       force: remove the run in the folder and start again.
       agents: "jax" or "sb3", whose implementation is trained; None for the one that `algorithm`
@@ -195,7 +197,7 @@ def train(
     if checkpoint_every is None:
         checkpoint_every = max(_MIN_STEPS_BETWEEN_CHECKPOINTS, steps // _CHECKPOINTS)
     choice("action_range", action_range, ACTION_RANGES)
-    protocol = resolve_protocol(protocol)
+    protocol = resolve_protocol(protocol or default_protocol(steps))
     uses = full_name(default_algorithm(document) if algorithm is None else algorithm, agents)
     entry = find(f"independent:{uses}" if independent else uses, "algorithm")
     independent = entry.kind == "independent"
@@ -255,6 +257,11 @@ def train(
             record = record.updated(status="finished")
             record.write(folder)
     return TrainingResult(folder, record, tuple(episodes), report, figures)
+
+
+def default_protocol(steps: int) -> str:
+    """Of the final evaluation, which should not take longer than the training."""
+    return "paper-v1" if steps >= DEFAULT_STEPS else "quick-v1"
 
 
 def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:

@@ -19,8 +19,10 @@ from sme_registry.errors import (
     PolicyError,
     SMEError,
 )
+from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.io import file_lock
 from sme_registry.spec import Suite
+from sme_registry.training import run as training_run
 from sme_registry.training import train
 from sme_registry.training.record import COLUMNS, Episode, EpisodeLog, RunRecord, read_episodes
 from tests.training.runs import NARROW, PROTOCOL, TINY, copy_files, short
@@ -307,3 +309,13 @@ def test_a_row_cut_short_and_rows_after_the_checkpoint_are_dropped(tmp_path):
     path.write_text("a,b\n1,2\n")
     with pytest.raises(OptionError, match="columns"):
         read_episodes(path)
+
+
+@pytest.mark.parametrize(("steps", "name"), [(19_999, "quick-v1"), (20_000, "paper-v1")])
+def test_a_short_training_is_evaluated_in_fewer_states(steps, name, tmp_path, monkeypatch):
+    def stop(learner, record, *others):
+        raise RuntimeError(record.protocol_digest)
+
+    monkeypatch.setattr(training_run, "learn", stop)
+    with pytest.raises(RuntimeError, match=resolve_protocol(name).digest):
+        train(TINY, steps=steps, folder=tmp_path / "run", progress=False)
