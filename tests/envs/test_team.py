@@ -1,4 +1,4 @@
-"""`SMETeamEnv`: a team of one is `SMEEnv`; what is refused, by whose name; pictures; beginnings."""
+"""`SMETeamEnv`: what is refused, by whose name; pictures; beginnings."""
 
 import copy
 import pickle
@@ -17,8 +17,6 @@ from sme_registry.errors import (
     SpecError,
     StateError,
 )
-from sme_registry.spec import SMESpec
-from sme_registry.teams import SMETeamEnv
 
 START = np.linspace(0.1, 0.9, 8)
 
@@ -31,51 +29,6 @@ def begun(spec="Team4", **kwargs):
 
 def middle(env):
     return {name: np.full(env.action_space(name).shape, 0.5) for name in env.possible_agents}
-
-
-@pytest.mark.parametrize(
-    ("fields", "action_range", "backend"),
-    [
-        ({}, "symmetric", "numba"),
-        ({"k": 7, "r_min": 0.3}, "symmetric", "numpy"),
-        ({"k": 3, "D": 0.3, "complexity": 3}, "unit", "numba"),
-        ({"k": 200}, "unit", "numpy"),
-    ],
-    ids=["default", "gated", "fragile", "late"],
-)
-def test_a_team_of_one_is_the_single_environment_number_for_number(
-    fields, action_range, backend, monkeypatch
-):
-    if backend == "numba":
-        pytest.importorskip("numba")
-    monkeypatch.setenv("SME_BACKEND", backend)
-    spec = SMESpec(**fields)
-    lone = spec.derive(team={"agents": [{"name": "lone_0", "action_dim": 4}]})
-    single = SMEEnv(spec, action_range=action_range)
-    teams = [SMETeamEnv(task, action_range=action_range) for task in (lone, spec)]
-    rng = np.random.default_rng(1)
-    for seed in (3, None, None):
-        observation, _ = single.reset(seed=seed)
-        for team in teams:
-            (shown,) = team.reset(seed=seed)[0].values()
-            np.testing.assert_array_equal(shown, observation)
-        ended = False
-        while not ended:
-            best = single.task.optimal_action(single.state)
-            action = best + rng.uniform(0.0, 0.6) * (rng.random(4) - best)
-            action = (2.0 * action - 1.0 if action_range == "symmetric" else action).astype("f4")
-            observation, reward, terminated, truncated, info = single.step(action)
-            ended = terminated or truncated
-            for team in teams:
-                (name,) = team.agents
-                shown, *rest = team.step({name: action})
-                np.testing.assert_array_equal(shown[name], observation)
-                np.testing.assert_array_equal(team.state(), single.state)
-                got = [part[name] for part in rest]
-                assert got[:3] == [reward, terminated, truncated]
-                assert got[3].keys() == info.keys()
-                for key in info:
-                    np.testing.assert_array_equal(got[3][key], info[key])
 
 
 def test_spaces_are_each_agents_own_and_the_same_object_each_time():
@@ -104,18 +57,6 @@ def test_symmetric_actions_are_the_unit_ones_rescaled_and_both_are_clipped():
         for name, info in ours[4].items():
             rescaled = 2.0 * info["optimal_action"] - 1.0
             np.testing.assert_array_equal(theirs[4][name]["optimal_action"], rescaled)
-
-
-def test_the_end_of_one_agent_ends_the_episode_of_all_with_the_same_flags():
-    env = begun("Team4", D=0.5, horizon=1)
-    actions = dict(zip(env.agents, np.split(env.task.optimal_action(START), 4), strict=True))
-    actions["agent_2"] = np.abs(actions["agent_2"] - 0.3)
-    _, rewards, terminated, truncated, infos = env.step(actions)
-    assert terminated == dict.fromkeys(env.possible_agents, True) == truncated
-    assert [rewards[name] for name in env.possible_agents] == pytest.approx([1, 1, 0, 1])
-    assert infos["agent_2"]["regret"] == 1.0
-    assert infos["agent_0"]["regret"] < 1e-12
-    assert env.agents == []
 
 
 def test_bad_actions_are_refused_by_their_agents_name_and_nothing_moves():

@@ -9,6 +9,7 @@ from sme_registry import SMESpec, materialize
 from sme_registry.envs import arguments
 from sme_registry.errors import ActionError, OptionError, SpecError, StateError
 from sme_registry.jax import CACHE_VARIABLE, env, prepare
+from sme_registry.jax import task as functions
 from sme_registry.jax.task import task_params
 from sme_registry.task import observe, step
 
@@ -27,14 +28,31 @@ DEEP = [
 ]
 
 
+def two(**fields):
+    """Tasks with shaping, of short episodes."""
+    fields = {"horizon": 3, "k": 2, "shaping": {"scale": 30, "discount": 0.9}, **fields}
+    return [SMESpec.from_dict({**fields, "seed": seed}) for seed in range(2)]
+
+
+NOISE = {"reward": 0.7, "transition": 0.3}
+KINDS = {
+    "shallow": SHALLOW,
+    "deep": DEEP,
+    "shaped": two(),
+    "noisy": two(noise=NOISE, D=0.1),
+    "compensated": two(noise=NOISE, safety={"tightness": 0.3, "compensated": True}),
+}
+
+
 @jax.jit
 def rollout(params, keys, actions):
-    """All steps of environments with their own tasks: `[STEPS, tasks, …]`."""
+    """All steps of environments with their own tasks, with their noise: `[STEPS, tasks, …]`."""
 
     def advance(state, inputs):
         keys, actions = inputs
+        noise = jax.vmap(functions.random_numbers)(keys, params).noise
         observation, after, *others = jax.vmap(env.step)(keys, state, actions, params)
-        return after, (state, observation, after, *others)
+        return after, (state, noise, observation, after, *others)
 
     observation, state = jax.vmap(env.reset)(keys[0], params)
     return observation, jax.lax.scan(advance, state, (keys[1:], actions))[1]
@@ -46,12 +64,13 @@ def near_optimal(specs):
     return (0.5 + 0.2 * rng.standard_normal((STEPS, len(specs), 4))).astype(np.float32)
 
 
-@pytest.mark.parametrize("specs", [SHALLOW, DEEP], ids=["shallow", "deep"])
-def test_a_batch_of_tasks_steps_as_in_numpy(specs):
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_batch_of_tasks_steps_as_in_numpy(kind):
+    specs = KINDS[kind]
     keys = jax.random.split(jax.random.key(0), (STEPS + 1, len(specs)))
     a = near_optimal(specs)
     run = jax.tree.map(np.asarray, rollout(task_params(specs), keys, a))
-    first, (before, observed, after, reward, done, info) = run
+    first, (before, noise, observed, after, reward, done, info) = run
     old, new = before.s, after.s
     ends = np.zeros(2, int)
     for row, spec in enumerate(specs):
@@ -59,10 +78,13 @@ def test_a_batch_of_tasks_steps_as_in_numpy(specs):
         s, t, accumulated = old[:1, row], np.zeros(1, np.int64), np.zeros((1, 1))
         assert (first[row] == observe(spec, s, t, accumulated)[0]).all()
         for i in range(STEPS):
-            one = step(task, s, t, accumulated, a[i, [row]].astype(float))
+            draws = None if noise is None else noise[i, [row]]
+            one = step(task, s, t, accumulated, a[i, [row]].astype(float), draws)
             t += 1
-            for name in ("similarity", "step_reward"):
-                assert abs(info[name][i, row] - getattr(one, name)[0, 0]) <= 1e-12
+            assert abs(info["similarity"][i, row] - one.similarity[0, 0]) <= 1e-12
+            for name in ("step_reward", "price", "shaping", "reward_noise"):
+                computed = info[name][i, row] if name in info else 0.0
+                assert abs(computed - getattr(one, name)[0, 0]) <= 1e-12
             assert info["regret"][i, row] == 1 - info["step_reward"][i, row]
             assert abs(reward[i, row] - one.reward[0, 0]) <= 1e-12
             assert info["terminated"][i, row] == one.terminated[0]
@@ -82,7 +104,8 @@ def test_a_batch_of_tasks_steps_as_in_numpy(specs):
             assert (new[i, row] == s[0]).all()
             assert after.t[i, row] == t[0]
             assert abs(after.accumulated_reward[i, row] - accumulated[0, 0]) <= 1e-12
-    assert (ends > 0).all()
+    assert ends[1] > 0
+    assert (ends[0] > 0) == any(spec.D > 0 for spec in specs)
 
 
 def test_a_step_without_a_batch_equals_that_in_a_batch():
@@ -107,6 +130,18 @@ def test_starts_are_uniform():
     quarters = np.stack([np.histogram(column, 4, (0, 1))[0] for column in starts.T])
     assert abs(quarters - 1024).max() < 5 * np.sqrt(4096 * 3 / 16)
     assert abs(np.corrcoef(starts.T) - np.eye(3)).max() < 5 / np.sqrt(4096)
+
+
+def test_the_noise_of_a_step_is_standard_normal_and_of_float32():
+    params = task_params(SMESpec(state_dim=3, noise={"reward": 1, "transition": 1}))
+    keys = jax.random.split(jax.random.key(0), 4096)
+    draw = jax.jit(jax.vmap(lambda key: functions.random_numbers(key, params).noise))
+    noise = np.asarray(draw(keys))
+    assert noise.shape == (4096, 4)
+    assert (noise == noise.astype(np.float32)).all()
+    assert abs(noise.mean(axis=0)).max() < 5 / np.sqrt(4096)
+    assert abs(noise.std(axis=0) - 1).max() < 5 / np.sqrt(2 * 4096)
+    assert abs(np.corrcoef(noise.T) - np.eye(4)).max() < 5 / np.sqrt(4096)
 
 
 def test_arrays_of_other_shapes_are_refused_before_a_step():
