@@ -49,7 +49,8 @@ from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation, isolation_for_own
 from leaderboard.gate.networks import constant_onnx, optimal_onnx
 from leaderboard.gate.sandbox import Confined, widths
-from leaderboard.store import Store, expire_uploads, unknown_submission
+from leaderboard.store import Store, unknown_submission
+from leaderboard.store.log import expire_uploads
 from sme_registry.io import sha256_of
 from sme_registry.spec import SMESpec
 
@@ -83,10 +84,7 @@ def upload_header(key: SigningKey, digest: str, receiver: Receiver, time: str | 
 
 
 def uploader(board: BoardDocument, header: str | None, digest: str, address: str) -> str:
-    """The public key whose header permits an upload to a server's address now.
-
-    A `Rejection` is `bad_signature`, `wrong_board` or `stale_time`.
-    """
+    """The public key whose header permits an upload to a server's address now; or a `Rejection`."""
     match = _HEADER.fullmatch(header or "")
     if match is None:
         raise Rejection(
@@ -162,10 +160,8 @@ def admit(
 ) -> bool:
     """Check a submission, its signature verified, and store it; False if the board has it.
 
-    `policy_file` returns a file's bytes by digest, of the size in the submission, which are stored
-    with it; by default the submitter's key has uploaded them. `isolation` is of the process that
-    reads its policies; if that does not start, a `ScoringFault` judges nothing. `address` is of the
-    server that it was sent to; None if it was given to the board's folder.
+    `policy_file` returns the bytes of a file, which are stored with it; by default the submitter's
+    key has uploaded them. `address` is of the server that it was sent to; None for a folder.
     """
     check_receiver(store.document, signed.receiver, address)
     known = store.entry(signed.id)
@@ -197,10 +193,9 @@ def admit(
 def submit_bundle(
     store: Store, folder: str | os.PathLike[str], key: SigningKey | None = None
 ) -> str:
-    """Admit a bundle: its submission and the policy files in its folder; returns the id.
+    """Admit a bundle, its policy files included, or store nothing; returns the id.
 
-    `key` is the submitter's, to sign a submission that is signed for no board yet. A `Rejection`
-    has the code of the first fault, and nothing is stored.
+    `key`, the submitter's, signs a submission that is signed for no board yet.
     """
     bundle = Bundle.read(folder)
     signed = bundle.signed
@@ -211,12 +206,7 @@ def submit_bundle(
 
 
 def withdraw(store: Store, signed: Signed[Withdrawal], address: str | None = None) -> bool:
-    """Withdraw a submission, whose page stays; False if it was withdrawn before.
-
-    `address` is of the server that it was sent to; None if it was given to the board's folder. A
-    `Rejection` is `unknown_submission`, `unsafe_name` (the reason), `wrong_board`, or
-    `bad_signature`, if the submission's own key did not sign it.
-    """
+    """Withdraw a submission, whose page stays; False if it was withdrawn before."""
     withdrawal = signed.content
     with store.transaction():
         row = store.entry(withdrawal.submission)
@@ -254,10 +244,7 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
 
 
 def check_manifest(board: BoardDocument, manifest: Manifest, at: datetime.datetime) -> None:
-    """Reject unsafe names and texts, and a time that is not near the board's.
-
-    That is `unsafe_name`, `schema` if the time does not exist, or `stale_time`.
-    """
+    """Reject unsafe names and texts, and a time that is not near the board's."""
     check_names(manifest, board.key)
     created, age_days = manifest.created, board.limits.age_days
     try:
@@ -282,8 +269,7 @@ def check_manifest(board: BoardDocument, manifest: Manifest, at: datetime.dateti
 def check_entrant(store: Store, submitter: Submitter, size: int) -> None:
     """Decide, in the transaction that stores so many bytes, whether a key may send them.
 
-    That is `name_taken`, or `quota`, of a day and of the board. The board's own key has no quota,
-    because nothing is shown without the reference rows.
+    The board's own key has no quota: nothing is shown without the reference rows.
     """
     holder = store.holder_of_name(submitter.name)
     if holder not in (None, submitter.key):

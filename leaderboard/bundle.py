@@ -162,18 +162,11 @@ def make_bundle(
     """Export the policies of runs, and sign a submission of them, written completely or not at all.
 
     What the board would reject is rejected here, with the same code. A Stable-Baselines3 .zip can
-    run code when it is loaded: give only files that you trust.
-
-    Args:
-      runs: folders of `sme train` or `sme study run`, folders that contain such, and tables.
-      runs_started: all runs ever started with this method, by class; for other classes, the number
-        of listed runs.
-      training: facts of the training; None takes them from the records of the runs.
-      algorithm: of folders with runs of several, the only one to submit.
-      receiver: the only board that accepts it, and its address. By default it is open, until
-        `submit_bundle` or `client.submit` signs for the board that it is sent to.
-      force: replace an existing bundle.
-      progress: called after each run with the number of finished runs and of all runs.
+    run code when it is loaded: give only files that you trust. `runs` are folders of `sme train` or
+    `sme study run`, folders that contain such, and tables; of several algorithms, `algorithm` is
+    the one to submit. `runs_started` are all runs ever started with this method, by class; else
+    those listed. `training` is taken from the records of the runs. `receiver` is the only board
+    that accepts it; by default it is open until it is sent.
     """
     folder = Path(folder)
     _refuse_existing(folder, force)

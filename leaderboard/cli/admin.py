@@ -22,7 +22,7 @@ from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import Isolation, available_isolation, isolation_for_own
 from leaderboard.scoring.worker import Work, run_scorers
-from leaderboard.store import collect_garbage
+from leaderboard.store.log import collect_garbage
 from leaderboard.web.pages import Section
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol

@@ -16,14 +16,14 @@ import typer
 from rich.markup import escape
 
 from leaderboard.documents.board import Folder
-from leaderboard.documents.result import METRICS, RANKED, Estimate, Metric, Result
+from leaderboard.documents.result import METRICS, RANKED, EntryRow, Estimate, Metric, Result
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError
 from leaderboard.scoring import ranking
 from leaderboard.scoring.ranking import REASONS, RankedRow
 from leaderboard.scoring.verify import VerifyReport
 from leaderboard.scoring.verify import verify as verify_board
-from leaderboard.store import EntryRow, Store
+from leaderboard.store import Store
 from leaderboard.web import client
 from leaderboard.web.client import MOST_BYTES, PublicView, public_view
 from leaderboard.web.client import fetch as fetch_board

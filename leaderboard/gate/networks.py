@@ -211,10 +211,7 @@ _TYPES = ("<f4", "<f8", "<i4", "<i8")
 def network_of(
     data: bytes, observation_dim: int, action_dim: int, isolation: Isolation | None = None
 ) -> NetworkProgram | None:
-    """The network of an ONNX file of these widths; None if a page cannot compute it.
-
-    A ScoringFault is raised if the child does not start, or the machine lacks memory or time.
-    """
+    """The network of an ONNX file of these widths; None if a page cannot compute it."""
     try:
         with Confined(isolation=isolation) as child:
             text = child.network(data, observation_dim, action_dim)

@@ -108,10 +108,8 @@ class SandboxLimits:
 class Confined:
     """A child process that reads files of strangers. Leaving the `with` block ends it.
 
-    Use it in the thread that created it: the process ends with that thread. `isolation` is None for
-    the one that this machine has. `runtime` is the version of onnxruntime that the process reports
-    before it reads any file. A Rejection closes the process, as all errors do; a ScoringFault, of
-    the isolation or of a machine without memory or processor time, judges nothing.
+    Use it in the thread that created it: the process ends with that thread. A Rejection closes the
+    process, as all errors do; a ScoringFault, of the isolation or of the machine, judges nothing.
     """
 
     def __init__(
@@ -327,9 +325,8 @@ class Sandbox(Confined):
     def check_rows(self, observations: Observations, rows: int = 16) -> None:
         """Reject a model whose action in a state depends on the other rows of the batch.
 
-        The batch in random order and in two parts, and some rows one at a time, must give the same
-        actions as the batch. Actions are compared as they are scored, clipped to [0, 1]. The
-        system's randomness draws the `rows` that are evaluated one at a time.
+        The batch in random order and in two parts, and `rows` one at a time, must give the same
+        actions, compared as they are scored, clipped to [0, 1].
         """
         rng = np.random.default_rng(secrets.randbits(128))
         batched = self(observations)

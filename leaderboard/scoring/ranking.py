@@ -54,6 +54,7 @@ from leaderboard.documents.result import (
     REFERENCES,
     AgentScore,
     ClassScore,
+    EntryRow,
     Estimate,
     Isolation,
     Metric,
@@ -63,7 +64,6 @@ from leaderboard.documents.result import (
 )
 from leaderboard.documents.submission import Submission, check_runs, skeleton
 from leaderboard.errors import NotPublishable
-from leaderboard.store import EntryRow
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.statistics import Array, Statistic, aggregate, iqm, mean, stratified_bootstrap
@@ -114,11 +114,7 @@ class RankedRow:
 
 
 def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
-    """Every scored entry that is not withdrawn, ordered by its score, the best first.
-
-    Lower is better in every metric; equal scores are in order of submission, equal decays in that
-    of the mean regret over all regions.
-    """
+    """Every scored entry that is not withdrawn, the best first; equal ones as submitted."""
     history = superseded(entries)
     scored = [
         (entry, entry.scores, _reason(entry, entry.scores, metric, history))
@@ -151,11 +147,7 @@ def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
 
 
 def superseded(entries: list[EntryRow]) -> set[str]:
-    """Ids of the entries that are history: their key has a later one like them.
-
-    Like them is one with the same method name and version, up to look-alike spelling, or with the
-    same policies. Only an entry that can be ranked supersedes others.
-    """
+    """Ids of entries of which a later one that can be ranked has the method or the policies."""
     latest: set[tuple[str, ...]] = set()
     history = set()
     for entry in sorted(entries, key=lambda entry: -entry.sequence):
@@ -238,10 +230,7 @@ def refuse_unpublishable(entries: list[EntryRow]) -> None:
 
 
 def _known_scores(scores: Scores, regret: float) -> Iterator[tuple[str, float, float]]:
-    """Field, value and expected value of a reference row with this regret in every region.
-
-    Excludes what follows from the similarity, where the constant policy's differs between regions.
-    """
+    """Field, value and expected value of a reference row; not what follows from similarity."""
     for region, estimate in enumerate(scores.normalised_regret):
         yield f"normalised_regret.{region}", estimate.value, regret
     yield "wd_regret", scores.wd_regret.value, regret
@@ -318,8 +307,7 @@ def result_of(
 def never_listed(board: BoardDocument, submission: Submission) -> list[RunScore]:
     """A score of 1 for each run that was started and is not listed, in the order of classes.
 
-    Each is on the instance of its class with the fewest runs so far, the first of these in the
-    suite's order. A `Rejection` is one of `check_runs`.
+    Each is on the instance of its class with the fewest runs so far, the suite's first.
     """
     check_runs(board.suite, submission)
     listed = Counter(run.spec for run in submission.runs)
@@ -406,10 +394,7 @@ def _strata(groups: Groups) -> Iterator[tuple[str, list[RunScore], Statistic, fl
 
 
 def is_oracle_like(scores: Scores, rules: int, runs: Sequence[RunScore] = ()) -> bool:
-    """Whether the method, or any of its runs, acts nearly as π* does.
-
-    A method that is π* on some instances only need have no small mean.
-    """
+    """Whether the method, or any of its runs, acts nearly as π* does."""
     wd, ood = scores.wd_regret.value, scores.ood_regret.value
     growth = scores.ood_decay.value if rules == 2 else ood - wd
     return any(
@@ -452,10 +437,7 @@ def levels_of(protocol: EvaluationProtocol) -> tuple[float, ...]:
 
 
 def failed_run(protocol: EvaluationProtocol, class_name: str, spec: str | None) -> RunScore:
-    """A run without a policy: 1 in every region and every metric.
-
-    `spec` is the digest of the instance, None if the run is not listed.
-    """
+    """A run without a policy: 1 in every region and every metric."""
     regrets = (1.0,) * len(protocol.edges)
     metrics: dict[str, Any] = {**run_metrics(regrets, None, levels_of(protocol), RULES)}
     return RunScore(

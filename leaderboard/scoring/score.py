@@ -120,14 +120,8 @@ def score_submission(
     """Score every run of an admitted submission, and the method over its runs.
 
     The result is a function of board, submission and files up to floating-point rounding, but for
-    `RunScore.actions`, and a rejection if a policy file, or its behaviour, is rejected. Where a
-    sandbox does not start, was ended from outside, or lacks memory or processor time, a
-    `ScoringFault` judges nothing.
-
-    Args:
-      policy_file: returns a file's bytes by its digest.
-      progress: called after each batch with the number of evaluated states and of all states.
-      isolation: of the sandbox; None for the one that this machine has.
+    `RunScore.actions`, and a rejection if a policy file, or its behaviour, is rejected. A
+    `ScoringFault`, of the sandbox or of the machine, judges nothing.
     """
     machine = _Machine(isolation or available_isolation())
     try:
@@ -298,11 +292,7 @@ class Behaviours:
         self._runs: dict[str, list[tuple[str, list[_Actions]]]] = defaultdict(list)
 
     def observe(self, run: str, spec: SMESpec, policy: Callable[[Any], Any]) -> str | None:
-        """Reject (`run_repeated`) a run, so named, whose policy is like one observed before.
-
-        Returns the digest of its actions, which are of the unit range, in the board's states; None
-        if it hardly varies there.
-        """
+        """Reject (`run_repeated`) a run like one before; digest its actions in board states."""
         prepared = as_policy(policy, spec, action_range="unit")
         actions = self._actions(spec, prepared, self._submission)
         for earlier, others in self._runs[spec.digest]:

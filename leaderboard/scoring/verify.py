@@ -28,11 +28,12 @@ from typing import Any, Literal
 
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.result import Result, RunScore
-from leaderboard.documents.submission import Run
+from leaderboard.documents.submission import Run, Submission
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.scoring.ranking import failed_run, levels_of, never_listed, result_of, run_metrics
 from leaderboard.scoring.score import agent_names, evaluation_seed, score_submission
-from leaderboard.store import LogEntry, Store, digest_of, read_document
+from leaderboard.store import Store
+from leaderboard.store.log import LogEntry, digest_of, read_document
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.io import TEMPORARY, integer_in
@@ -79,7 +80,40 @@ class Note:
     difference: Difference
 
 
-Part = Callable[[Store, Progress], tuple[list[Row], list[Note]]]
+@dataclass
+class Findings:
+    """What was checked so far, and what this machine does not confirm."""
+
+    progress: Progress
+    rows: list[Row] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
+
+    def report(self, what: str, checked: int, unchecked: int = 0, why: str = "") -> None:
+        self.rows.append(Row(what, checked, unchecked, why))
+
+    def compare(
+        self, results: Iterable[tuple[str, Any, Any]], *unchecked: tuple[int, str], of: str = ""
+    ) -> None:
+        """Note the entries, by name, whose recorded result differs from one that is scored here."""
+        count, others = 0, Counter[str]()
+        for name, recorded, here in results:
+            found = _other_result(recorded, here)
+            if found is not None:
+                self.notes.append(Note(name, found))
+            others.update(
+                f"{package} {version}, here {here.versions[package]}"
+                for package, version in recorded.versions.items()
+                if version != here.versions.get(package, version)
+            )
+            count += 1
+            self.progress(name)
+        why = "; ".join(f"{number} {reason}" for number, reason in unchecked if number)
+        self.report(f"{of}results, scored again", count, sum(n for n, _ in unchecked), why)
+        for other, number in others.items():
+            self.report(f"{of}results of other versions", number, 0, other)
+
+
+Part = Callable[[Store, Findings], None]
 """Verifies a part of a board whose log was followed."""
 
 
@@ -112,13 +146,9 @@ def verify(
 ) -> VerifyReport:
     """Verify a board without writing anything; a `TamperedError` names the first altered value.
 
-    Args:
-      rescore: number of results, rejections too, whose submissions to score again; or "all".
-      seed: of their draw, to repeat one; None for the system's randomness, which nobody predicts.
-      contains: digest of an entry that the log once had; None to skip this check.
-      board: how to open it: one with further tracks needs their class.
-      parts: what else to verify, of further tracks.
-      progress: called with what was just checked.
+    `rescore` submissions are scored again, drawn by `seed`, by default the system's randomness,
+    which nobody predicts. `contains` is the digest of an entry that the log once had. A board with
+    further tracks needs its class, and what verifies them, `parts`.
     """
     if rescore != "all":
         integer_in("rescore", rescore, 0, advice="Leave it out for none.")
@@ -131,21 +161,20 @@ def verify(
             _check_numbering(store, head.sequence + 1)
         if digest is not None:
             _check_contains(store, digest)
-        verifier = _Verifier(store, progress or (lambda _: None))
+        findings = Findings(progress or (lambda _: None))
+        verifier = _Verifier(store, findings)
         verifier.check_signatures()
         verifier.check_files()
         scored = verifier.check_results()
         drawn = draw(scored, rescore, seed)
         verifier.score_again(drawn, len(scored))
         for part in parts:
-            rows, notes = part(store, verifier.progress)
-            verifier.rows += rows
-            verifier.notes += notes
+            part(store, findings)
     return VerifyReport(
         log_sequence=head.sequence,
         log_digest=head.digest,
-        rows=(Row("log entries, and their documents", head.sequence + 1), *verifier.rows),
-        notes=tuple(verifier.notes),
+        rows=(Row("log entries, and their documents", head.sequence + 1), *findings.rows),
+        notes=tuple(findings.notes),
         missing=tuple(verifier.missing),
         rescore_seed=seed if drawn else None,
     )
@@ -189,6 +218,13 @@ def _short(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"{len(value)} values"
     return f"{value}"[:80]
+
+
+def _other_result(recorded: Any, here: Any) -> Difference | None:
+    verdicts = [getattr(each, "code", "") or "scored" for each in (recorded, here)]
+    if verdicts[0] != verdicts[1]:
+        return Difference("verdict", *verdicts)
+    return difference(compared(recorded), compared(here), RESCORED)
 
 
 def compared(result: Any) -> dict[str, Any]:
@@ -269,12 +305,10 @@ def _check_contains(store: Store, digest: str) -> None:
 
 @dataclass
 class _Verifier:
-    """The checks of one board, whose log was followed, and what they have found."""
+    """The checks of one board, whose log was followed."""
 
     store: Store
-    progress: Progress
-    rows: list[Row] = field(default_factory=list)
-    notes: list[Note] = field(default_factory=list)
+    findings: Findings
     missing: list[str] = field(default_factory=list)
 
     def check_signatures(self) -> None:
@@ -291,7 +325,7 @@ class _Verifier:
                     entry.id, f"the signature of this {what} does not match the submitter's key"
                 )
             count += 1 + (withdrawal is not None)
-        self.rows.append(Row("signatures of submitters", count))
+        self.findings.report("signatures of submitters", count)
 
     def check_files(self) -> None:
         """Check that every file in objects/ has its digest, and that none is missing."""
@@ -302,16 +336,15 @@ class _Verifier:
                 raise TamperedError(where, "is not a file of a board")
             self.store.objects.read(digest)
             count += 1
-            self.progress(digest)
+            self.findings.progress(digest)
         named = self.store.named_objects()
         absent = [digest for digest in named if not self.store.objects.has(digest)]
         self.missing += [digest for digest in absent if self.store.is_public(digest)]
         secret = len(absent) - len(self.missing)
-        self.rows.append(
-            Row("files by their digests", count, secret, "not published" * bool(secret))
-        )
+        why = "not published" * bool(secret)
+        self.findings.report("files by their digests", count, secret, why)
         if self.missing:
-            self.rows.append(Row("published files", 0, len(self.missing), "not in this folder"))
+            self.findings.report("published files", 0, len(self.missing), "not in this folder")
 
     def check_results(self) -> list[str]:
         """Check that the scores of each result follow from its runs; returns the submissions."""
@@ -324,40 +357,32 @@ class _Verifier:
                 refuse_contradiction(self._contradiction(result), entry.id)
             ids.append(entry.id)
             runs += sum(run.artefact is not None for run in result.runs)
-            self.progress(entry.id)
-        self.rows.append(Row("results, from their runs", len(ids)))
+            self.findings.progress(entry.id)
+        self.findings.report("results, from their runs", len(ids))
         if runs:
             reason = "copies show only where all bits of actions are equal"
             if self.store.document.rules == 2:
                 reason = "earlier versions computed rounding, sketches and copies"
-            self.rows.append(Row("marks of runs", 0, runs, reason))
+            self.findings.report("marks of runs", 0, runs, reason)
         return ids
 
     def score_again(self, drawn: Sequence[str], scored: int) -> None:
         """Score submissions again, through gate, sandbox and evaluation, and compare."""
-        count, others = 0, Counter[str]()
-        for id in drawn:
-            submission, recorded = self.store.submission(id).content, self.store.result(id)
-            assert recorded is not None
-            files = [run.artefact.sha256 for run in submission.runs if run.artefact is not None]
-            if not all(map(self.store.objects.has, files)):
-                continue
-            again = score_submission(self.store.document, submission, self.store.objects.read)
-            verdicts = recorded.code or "scored", again.code or "scored"
-            if verdicts[0] != verdicts[1]:
-                found: Difference | None = Difference("verdict", *verdicts)
-            else:
-                found = difference(compared(recorded), compared(again), RESCORED)
-            if found is not None:
-                self.notes.append(Note(id, found))
-            others.update(other_versions(recorded.versions, again.versions))
-            count += 1
-            self.progress(id)
-        left = (scored - len(drawn), "not drawn: --rescore")
-        absent = (len(drawn) - count, "their policy files are not here")
-        why = "; ".join(f"{number} {reason}" for number, reason in (left, absent) if number)
-        self.rows.append(Row("results, scored again", count, scored - count, why))
-        self.rows += [Row("results of other versions", n, 0, other) for other, n in others.items()]
+        submissions = {id: self.store.submission(id).content for id in drawn}
+        whole = {id: each for id, each in submissions.items() if self._has_policies(each)}
+        document, read = self.store.document, self.store.objects.read
+        self.findings.compare(
+            (
+                (id, self.store.result(id), score_submission(document, submission, read))
+                for id, submission in whole.items()
+            ),
+            (scored - len(drawn), "not drawn: --rescore"),
+            (len(drawn) - len(whole), "their policy files are not here"),
+        )
+
+    def _has_policies(self, submission: Submission) -> bool:
+        files = [run.artefact.sha256 for run in submission.runs if run.artefact is not None]
+        return all(map(self.store.objects.has, files))
 
     def _contradiction(self, result: Result) -> Difference | None:
         """The first value of a result that does not follow from the regrets of its runs."""
@@ -404,12 +429,3 @@ def _expected_run(
             "evaluation_seed": evaluation_seed(board.protocol.digest, run.spec, digest),
         }
     )
-
-
-def other_versions(recorded: dict[str, str], here: dict[str, str]) -> list[str]:
-    """The packages that had another version when a result was recorded."""
-    return [
-        f"{name} {version}, here {here[name]}"
-        for name, version in recorded.items()
-        if version != here.get(name, version)
-    ]

@@ -16,6 +16,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from multiprocessing import connection
 from multiprocessing.connection import Connection
@@ -27,7 +28,8 @@ from leaderboard.documents.result import Result
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import Isolation
 from leaderboard.scoring.score import Progress, score_submission
-from leaderboard.store import Claim, Store
+from leaderboard.store import Store
+from leaderboard.store.queue import Claim
 from sme_registry.errors import MissingDependencyError, SMEError
 from sme_registry.io import integer_in
 from sme_registry.io.system import block_interrupts, defer_interrupts, unblock_interrupts
@@ -71,22 +73,10 @@ def run_scorer(
     isolation: Isolation | None = None,
     work: Work = Work(),  # frozen
 ) -> int:
-    """Score in this process, one submission after another.
+    """Score in this process, one submission after another; returns the number of results.
 
-    A submission that cannot be scored because of a fault (no memory, an altered file, a sandbox
-    that does not start) waits, with the fault in its `EntryRow`. If the board cannot be written to,
-    a result is kept for a while before that is an error.
-
-    Args:
-      path: the board's folder.
-      worker: the scorer's unique name; None for a new one.
-      until_empty: return when nothing can be claimed; otherwise wait for more.
-      progress: called while a submission is scored, with the states done and the states in all.
-      stop: called between two submissions; True ends the scorer.
-      retry: whether submissions that earlier faults have postponed are tried at once.
-
-    Returns:
-      The number of results written.
+    A submission that cannot be scored because of a fault waits, with the fault in its `EntryRow`.
+    If the board cannot be written to, a result is kept for a while before that is an error.
     """
     worker = worker_name() if worker is None else worker
     patience = _UNWRITTEN_SECONDS if until_empty else _UNWRITTEN_SECONDS_SERVED
@@ -148,10 +138,7 @@ def _score(
 def _finish(
     store: Store, claim: Claim, result: Result, patience: float, stop: Callable[[], bool]
 ) -> bool:
-    """Write a result, and keep trying for so many seconds, for example while the disk is full.
-
-    Returns whether the claim was still current. If it cannot be written, that is no fault.
-    """
+    """Write a result, and keep trying for so many seconds; False if the claim was lost."""
     deadline = time.monotonic() + patience
     while True:
         try:
@@ -167,46 +154,46 @@ def _finish(
 
 
 @contextlib.contextmanager
-def _heartbeats(store: Store, claim: Claim) -> Iterator[None]:
-    """Renew a claim from a thread, four times in its lifetime."""
-    done = threading.Event()
-
-    def beat() -> None:
-        while not done.wait(claim.seconds / 4):
-            with contextlib.suppress(SMEError):  # a full disk may have room the next time
-                if not store.queue.heartbeat(claim):
-                    return
-
-    thread = threading.Thread(target=beat, name=f"heartbeat of {claim.worker}", daemon=True)
+def beside(name: str, work: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Let a thread work while the block runs; the event tells it to end."""
+    stop = threading.Event()
+    thread = threading.Thread(target=work, args=(stop,), name=name, daemon=True)
     thread.start()
     try:
         yield
     finally:
-        done.set()
+        stop.set()
         thread.join()
 
 
-@contextlib.contextmanager
+def _heartbeats(store: Store, claim: Claim) -> AbstractContextManager[None]:
+    """Renew a claim from a thread, four times in its lifetime."""
+
+    def beat(stop: threading.Event) -> None:
+        while not stop.wait(claim.seconds / 4):
+            with contextlib.suppress(SMEError):  # a full disk may have room the next time
+                if not store.queue.heartbeat(claim):
+                    return
+
+    return beside(f"heartbeat of {claim.worker}", beat)
+
+
 def background_scorers(
     path: str | Path,
     workers: int,
     isolation: Isolation | None = None,
     work: Work = Work(),  # frozen
-) -> Iterator[None]:
+) -> AbstractContextManager[None]:
     """Run scorer processes while the block runs, watched by a thread.
 
-    With 0 workers, one does jobs, if it knows how, and none scores submissions.
-
-    Nothing but the end of the block ends the scoring: after an error it starts again, first after
-    a second, then after growing pauses of up to five minutes.
+    With 0 workers, one does jobs, if it knows how. Nothing but the end of the block ends the
+    scoring: after an error it starts again, after growing pauses of up to five minutes.
     """
     if not workers and work.job is None:
-        yield
-        return
+        return contextlib.nullcontext()
     work = replace(work, submissions=workers > 0)
-    stop = threading.Event()
 
-    def score() -> None:
+    def score(stop: threading.Event) -> None:
         pause = _FIRST_PAUSE
         while not stop.is_set():
             begun = time.monotonic()
@@ -226,13 +213,7 @@ def background_scorers(
                 stop.wait(pause)
                 pause = min(2.0 * pause, _LONGEST_PAUSE)
 
-    thread = threading.Thread(target=score, name="scorers", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    return beside("scorers", score)
 
 
 def run_scorers(
@@ -248,21 +229,9 @@ def run_scorers(
 ) -> int:
     """Score in several processes at once; one that dies is replaced and its submission rescored.
 
-    Submissions that earlier faults have postponed are tried at once. One that cannot be scored
-    keeps waiting, with the fault in its `EntryRow`. Ctrl-C stops all processes and releases their
-    claims.
-
-    Args:
-      path: the board's folder.
-      workers: the largest number of processes.
-      until_empty: return when nothing can be scored any more, even by another process; otherwise
-        wait for more, and replace processes that die as long as it takes, after growing pauses.
-      progress: called with the submissions done since the start, and these plus those that wait.
-      stop: called a few times a second; True ends the scoring.
-      started: called with the process id of each new process.
-
-    Returns:
-      The number of submissions done since the start.
+    Returns the number of submissions done. With `until_empty`, it ends when nothing can be scored
+    any more, even by another process; otherwise it replaces processes that die as long as it takes.
+    Ctrl-C stops all processes and releases their claims.
     """
     integer_in("workers", workers, 1, advice="Leave it out for one.")
     with work.board.open(path) as store:

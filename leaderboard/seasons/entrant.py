@@ -372,7 +372,7 @@ def served_season(url: str, id: str) -> tuple[str, Receiver]:
             f"season={id!r:.80}: must be an id of letters, digits, '_' and '-'. Copy it from the "
             "board."
         )
-    with ServedBoard(url, insecure=False) as served:
+    with ServedBoard(url) as served:
         answer = served.request("GET", f"/api/seasons/{id}")
         try:
             found = Season.from_dict(answer["document"], "season.json")
@@ -382,13 +382,9 @@ def served_season(url: str, id: str) -> tuple[str, Receiver]:
 
 
 def request_ticket(url: str, season: str, signed: Signed[TicketRequest], key: SigningKey) -> Ticket:
-    """Start a ticket, or get the one that this request has started before.
-
-    `season` is its id, and `key` the entrant's, which signed the request for this board. The
-    ticket has the signer of its answers.
-    """
+    """Start a ticket, or get the one that this request has started before, with its signer."""
     sign = functools.partial(upload_header, key, signed.id, signed.receiver)
-    with ServedBoard(url, insecure=False) as served:
+    with ServedBoard(url) as served:
         answer = served.request("POST", tickets_path(season), signed.to_bytes(), sign)
     try:
         ticket = Ticket.from_dict(answer, "ticket")
@@ -406,7 +402,7 @@ def send_entry(
     progress: Sent,
 ) -> None:
     """Send an entry of a sealed-offline season, and first the files that it names, by digest."""
-    with ServedBoard(url, insecure=False) as served:
+    with ServedBoard(url) as served:
         path = f"/api/seasons/{season}/entries"
         served.send(path, signed, answers, answers.__getitem__, key, progress)
 

@@ -204,11 +204,7 @@ class Instance:
             return self._playing().started
 
     def step(self, body: bytes, signature: str = "") -> bytes:
-        """Take the steps of a request, or answer the last one again.
-
-        `signature` is that of the transcript before it, where one is due. A rejected request has
-        taken no step.
-        """
+        """Take the steps of a request, signed where due, or answer the last one again."""
         with self._lock:
             self._check_running()
             play = self._playing()
@@ -249,10 +245,7 @@ class Instance:
                 return read_regular(self._challenge_path, 2**28)
 
     def answer(self, data: bytes, signature: str) -> bool:
-        """Store the answers to the challenge, an .npy file; False if the same ones are stored.
-
-        `signature` is that of the transcript with them.
-        """
+        """Store the answers to the challenge, an .npy file; False if the same ones are stored."""
         with self._lock, storage():
             if self.answered and read_regular(self._answers_path, len(data) + 1) == data:
                 io.sync_folder(self._answers_path.parent)  # which may have failed the first time

@@ -60,10 +60,7 @@ _END = 0
 
 
 class Journal:
-    """One journal, of `requests` so far; no more can follow where it has `ended`.
-
-    No file stays open between two steps.
-    """
+    """The requests on one instance so far; no file stays open between two steps."""
 
     def __init__(self, path: Path, lanes: int, action_dim: int) -> None:
         self.path, self.lanes, self.action_dim = path, lanes, action_dim
@@ -86,10 +83,7 @@ class Journal:
 
     @classmethod
     def open(cls, path: Path, known: int = 0) -> Journal:
-        """The journal of a file, up to its last whole record; writes nothing.
-
-        The first `known` records, which were whole before, are not read again.
-        """
+        """The journal of a file, up to its last whole record; the first `known` are not read."""
         with open_regular(path) as stream:
             header = stream.read(_START)
             if len(header) < _START or header[_HEADER.size :] != _crc(header[: _HEADER.size]):
@@ -215,9 +209,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 class Play:
     """An instance that has begun, with a budget of steps over all its lanes.
 
-    `head` is that of the transcript after all `requests`, `last` the last request and its answer,
-    and `signed` how many requests the entrant has signed: −1 before the first signature. The
-    episodes of the first lane have the seed, those of lane i seed + i.
+    The episodes of the first lane have the seed, those of lane i seed + i.
     """
 
     def __init__(self, spec: SMESpec, seed: int, chain: Chain, lanes: int, budget: int) -> None:
@@ -319,7 +311,6 @@ def played_bytes(season: Season, result: SealedResult | None = None) -> int:
     """The most bytes that the journals, challenges, answers and snapshots of a ticket take.
 
     A journal is longest where a single lane is stepped: then each step has a record of its own.
-    After the ticket's result nothing more is written.
     """
     total = 0
     rows = rows_of(season.protocol)

@@ -18,8 +18,8 @@ from __future__ import annotations
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NoReturn
@@ -28,14 +28,9 @@ from leaderboard.documents.result import RunScore
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.ranking import failed_run
 from leaderboard.scoring.verify import (
-    RESCORED,
     Difference,
-    Note,
-    Row,
-    compared,
+    Findings,
     contradiction,
-    difference,
-    other_versions,
     refuse_contradiction,
     with_metrics,
 )
@@ -84,10 +79,7 @@ def dataset_path(folder: Path, season: str, hidden: Hidden) -> Path:
 
 
 def refuse_unfit(terms: Terms, limit: int, runs_to_rank: int) -> None:
-    """Refuse a season with answers of more bytes than a board takes, or in which nobody has a rank.
-
-    A rank on the board needs so many runs in each class.
-    """
+    """Refuse a season whose answers a board does not take, or in which nobody has a rank."""
     for member in terms.classes:
         size = table_bytes(rows_of(terms.protocol), member.setting.action_dim)
         if size > limit:
@@ -108,8 +100,7 @@ def refuse_unfit(terms: Terms, limit: int, runs_to_rank: int) -> None:
 def read_plan(plan: Any, source: str = "plan") -> Terms:
     """The terms of a season that is not generated yet, with digests of zeros.
 
-    `plan` has the fields of `Terms`, without `published`. `protocol` may be left out for the one in
-    the catalogue that `protocol_name` names. Errors call the plan `source`.
+    `plan` has the fields of `Terms` but `published`; `protocol` may be left out.
     """
     fields = dict(plan) if isinstance(plan, dict) else {}
     name = fields.get("protocol_name")
@@ -139,11 +130,7 @@ def create_season(
     folder: str | os.PathLike[str],
     progress: Progress | None = None,
 ) -> Season:
-    """Generate all that is published of a season, into a new folder, completely or not at all.
-
-    It gets `season.json` and, offline, data sets and challenge states. `progress` is called with
-    the number of instances done, and of all.
-    """
+    """Generate all that is published of a season, into a new folder, completely or not at all."""
     with build_folder(Path(folder)) as building:
         published = []
         if plan.track == "sealed-offline":
@@ -203,10 +190,7 @@ def files_of_seasons(store: Store) -> Iterator[Files]:
 def check_published(
     season: Season, folder: str | os.PathLike[str], progress: Progress | None = None
 ) -> int:
-    """Check that data sets and challenge states are those that a season was committed to.
-
-    Returns their number.
-    """
+    """Check data sets and challenge states against their digests; returns their number."""
     folder = Path(folder)
     for done, (hidden, digests) in enumerate(
         zip(season.hidden, season.published, strict=False), start=1
@@ -304,34 +288,25 @@ def _dataset_id(season: str, hidden: Hidden) -> str:
 
 
 def verify_seasons(
-    store: SeasonStore, progress: Callable[[str], None], published: Sequence[str | Path] = ()
-) -> tuple[list[Row], list[Note]]:
+    store: SeasonStore, findings: Findings, published: Sequence[str | Path] = ()
+) -> None:
     """Verify all seasons of a board, whose log was followed.
 
-    `published` are folders as `season new` wrote them, of seasons whose board has no copy. A
-    `TamperedError` names the first entry, ticket or value that does not follow, a `BoardError` a
-    published file that differs from its digest.
+    `published` are folders as `season new` wrote them, of seasons whose board has no copy.
     """
     folders = {read_season(folder).digest: Path(folder) for folder in published}
-    rows, notes = [], []
     for row in store.seasons():
-        verifier = _SeasonVerifier(store, row, progress, folders)
-        verifier.check()
-        rows += verifier.rows
-        notes += verifier.notes
-    return rows, notes
+        _SeasonVerifier(store, row, findings, folders).check()
 
 
 @dataclass
 class _SeasonVerifier:
-    """The checks of one season, and what they have found."""
+    """The checks of one season."""
 
     store: SeasonStore
     of: SeasonRow
-    progress: Callable[[str], None]
+    findings: Findings
     folders: Mapping[str, Path]
-    rows: list[Row] = field(default_factory=list)
-    notes: list[Note] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.season: Season = self.store.season(self.of.digest)
@@ -355,7 +330,7 @@ class _SeasonVerifier:
         self.score_again(master)
 
     def report(self, what: str, checked: int, unchecked: int = 0, why: str = "") -> None:
-        self.rows.append(Row(f"{self.of.id}: {what}", checked, unchecked, why))
+        self.findings.report(f"{self.of.id}: {what}", checked, unchecked, why)
 
     def name(self, subject: str) -> str:
         """What to call an entry or ticket, by its id."""
@@ -406,7 +381,7 @@ class _SeasonVerifier:
                 message = "its data set or challenge states do not follow from the master"
                 raise TamperedError(where, message)
             outcomes[outcome] += 1
-            self.progress(f"{expected.class_name} {expected.instance}")
+            self.findings.progress(f"{expected.class_name} {expected.instance}")
         why = "this processor rounds otherwise, and the published arrays are not here"
         unknown, rounded = outcomes["unknown"], outcomes["within rounding"]
         self.report("data sets", outcomes["exactly"], unknown, why * bool(unknown))
@@ -419,25 +394,17 @@ class _SeasonVerifier:
         for row in scored:
             if row not in counted:
                 self.refuse(row, "has a result, and does not count")
-        whole, others = [row for row in scored if self.has_answers(row)], Counter[str]()
-        for row, again in zip(whole, self.scored(master, whole), strict=True):
-            recorded = self.store.sealed_result(row)
-            assert recorded is not None
-            found = difference(compared(recorded), compared(again), RESCORED)
-            if found is not None:
-                self.notes.append(Note(self.name(row.entrant.id), found))
-            others.update(other_versions(recorded.versions, again.versions))
-            self.progress(row.entrant.id)
+        whole = [row for row in scored if self.has_answers(row)]
         left = sum(row.result is None for row in counted)
-        reasons = (
+        self.findings.compare(
+            (
+                (self.name(row.entrant.id), self.store.sealed_result(row), here)
+                for row, here in zip(whole, self.scored(master, whole), strict=True)
+            ),
             (left, "not scored yet: repeat `sme-leaderboard season reveal`"),
             (len(scored) - len(whole), "their answers are not here"),
+            of=f"{self.of.id}: ",
         )
-        why = "; ".join(f"{number} {reason}" for number, reason in reasons if number)
-        count = len(whole)
-        self.report("results, scored again", count, left + len(scored) - count, why)
-        for other, number in others.items():
-            self.report("results of other versions", number, 0, other)
 
     def has_answers(self, row: SealedRow) -> bool:
         """Whether the answers of an offline entry are here; those of a ticket lie beside it."""

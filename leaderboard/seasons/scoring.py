@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 from leaderboard.admission import ReadFile, check_entrant, check_manifest, check_stored
 from leaderboard.documents.board import RULES, check_receiver
-from leaderboard.documents.result import Metric, RunScore, Scores
+from leaderboard.documents.result import EntryRow, Metric, RunScore, Scores
 from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import Artefact, Knowledge
 from leaderboard.errors import Rejection
@@ -57,7 +57,6 @@ from leaderboard.seasons.store import (
     SealedRow,
     SeasonStore,
 )
-from leaderboard.store import EntryRow
 from leaderboard.web.tables import row_facts
 from sme_registry import EvaluationProtocol, SMESpec
 from sme_registry.errors import PolicyError
@@ -174,10 +173,7 @@ def sealed_result(
     stepping: Sequence[Stepping] = (),
     rules: int = RULES,
 ) -> SealedResult:
-    """The result of scored runs, one on each hidden instance: θ, intervals and flags.
-
-    `draws` and `rules` are the board's.
-    """
+    """The result of scored runs, one on each hidden instance: θ, intervals and flags."""
     groups = _groups(season, [runs])
     scores = method_scores(groups, draws, season.digest)
     return SealedResult(
@@ -193,10 +189,7 @@ def sealed_result(
 
 
 def _groups(season: Season, entrants: Sequence[Sequence[RunScore]]) -> Groups:
-    """The runs of a method's entry or tickets, by class.
-
-    Each is in a group of its own: no two are on the same instance.
-    """
+    """The runs of an entry or of tickets, by class; each a group, as no two share an instance."""
     groups: Groups = {member.name: {} for member in season.classes}
     for number, runs in enumerate(entrants):
         for hidden, run in zip(season.hidden, runs, strict=True):
@@ -242,10 +235,7 @@ def by_key(store: SeasonStore, season: Season) -> dict[str, OfKey]:
 
 
 def score_entries(store: SeasonStore, name: str, progress: Progress | None = None) -> int:
-    """Score the counting entries of a revealed offline season that have no result yet.
-
-    Returns how many have one now; the tickets of an online season had theirs when they ended.
-    """
+    """Score what counts of a revealed offline season; returns how many have a result now."""
     season, master = store.season(name), store.revealed_master(name)
     rows = counting(store, season)
     if season.track == "sealed-online":
@@ -367,11 +357,9 @@ def enter(
 ) -> bool:
     """Check an entry, its signature verified, and store it; False if the board has it.
 
-    Args:
-      store, signed: the board and the entry.
-      answers: returns the bytes of an answer by digest; they are stored with the entry. By default
-        the entrant's key has uploaded them.
-      address: of the server that it was sent to; None if it was given to the board's folder.
+    `answers` returns the bytes of an answer, which are stored with the entry; by default the
+    entrant's key has uploaded them. `address` is of the server that it was sent to; None for a
+    folder.
     """
     check_receiver(store.document, signed.receiver, address)
     if store.entrant(signed.id) is not None:

@@ -20,7 +20,8 @@ import logging
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.documents.submission import shifted, utc
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.ranking import failed_run
+from leaderboard.scoring.worker import beside
 from leaderboard.seasons.instance import Instance, has_signed, storage, write_whole
 from leaderboard.seasons.journal import played_bytes
 from leaderboard.seasons.scoring import HiddenTask, score_runs, sealed_result
@@ -60,10 +62,7 @@ def deadline(season: Season, row: SealedRow) -> str:
 
 
 class Ticket:
-    """One ticket: it runs until the entrant ends it, or its deadline has passed.
-
-    Its `id` is that of the request; its `instances` are in the season's order.
-    """
+    """One ticket: it runs until the entrant ends it, or its deadline has passed."""
 
     def __init__(self, store: SeasonStore, season: Season, master: Master, row: SealedRow) -> None:
         self.number, self.id = row.number, row.entrant.id
@@ -216,10 +215,7 @@ class Ticket:
 def score_ticket(
     store: SeasonStore, season: Season, ticket: Ticket, *, replay: bool = False
 ) -> SealedResult:
-    """Score a ticket from its snapshots and answers; or `replay` its journals, too.
-
-    Nothing of the ticket may change any more. A TamperedError names what is not the entrant's.
-    """
+    """Score a ticket that is over from its snapshots and answers; or `replay` its journals, too."""
     runs, stepping = [], []
     versions: dict[str, str] = {}
     draws, rules = store.document.draws, store.document.rules
@@ -374,26 +370,17 @@ _AT_ONCE = 100  # results of unplayed tickets, of a second
 _log = logging.getLogger(__name__)
 
 
-@contextlib.contextmanager
-def attending(sessions: Collection[Sessions]) -> Iterator[None]:
+def attending(sessions: Collection[Sessions]) -> AbstractContextManager[None]:
     """Sync, and end tickets, in a thread while the block runs."""
     if not sessions:
-        yield
-        return
-    stop = threading.Event()
+        return contextlib.nullcontext()
 
-    def attend() -> None:
+    def attend(stop: threading.Event) -> None:
         while not stop.wait(_SECONDS):
             for each in sessions:
                 each.attend()
 
-    thread = threading.Thread(target=attend, name="seasons", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    return beside("seasons", attend)
 
 
 @dataclass(frozen=True)

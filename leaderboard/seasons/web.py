@@ -142,10 +142,7 @@ def _ranking(store: SeasonStore, season: str, metric: Metric, head: str) -> dict
 
 
 class SeasonRoutes:
-    """The handlers of a server at an address.
-
-    `secrets` are paths of the masters of the seasons that it steps.
-    """
+    """The handlers of a server, which steps the seasons whose masters are in `secrets`."""
 
     section = SECTION
 

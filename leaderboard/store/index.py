@@ -204,10 +204,7 @@ class Index:
         return EMPTY if row is None else Head(*row)
 
     def apply(self, entry: LogEntry, document: StrictModel | None = None) -> None:
-        """Apply the log entry after `head`; neither it nor `document`, if given, is written yet.
-
-        A `Rejection` says that the document is not allowed at the entry's time.
-        """
+        """Apply the log entry after `head`, before it and its document, if given, are written."""
         if entry.event not in self._kinds:
             raise BoardError(
                 f"{entry.file}: event={entry.event}: must be one of {', '.join(self._kinds)}. "

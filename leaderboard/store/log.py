@@ -37,7 +37,7 @@ from sme_registry.io import TEMPORARY, is_regular, read_regular, sha256_of
 from sme_registry.spec.document import Digest, Integer, SchemaVersion, StrictModel
 
 if TYPE_CHECKING:
-    from leaderboard.store.store import Store
+    from leaderboard.store import Store
 
 try:
     import fcntl
@@ -227,10 +227,7 @@ _Model = TypeVar("_Model", bound=StrictModel)
 
 
 def write_file(path: Path, data: bytes, *, new: bool = False) -> None:
-    """Write a file completely or not at all, durable on a loss of power; its folder may not exist.
-
-    With `new`, a file that exists is an error.
-    """
+    """Write a file completely or not at all, durable on a loss of power, in a folder or none."""
     try:
         if not path.parent.is_dir():
             path.parent.mkdir(parents=True, exist_ok=True)

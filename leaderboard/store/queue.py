@@ -21,7 +21,7 @@ from leaderboard.store.index import Index
 from leaderboard.store.log import uptime
 
 if TYPE_CHECKING:
-    from leaderboard.store.store import Store
+    from leaderboard.store import Store
 
 LEASE_SECONDS = 60.0
 RETRY_SECONDS, LONGEST_RETRY_SECONDS = 10.0, 3600.0
@@ -63,14 +63,7 @@ the faults that waiting ones have met."""
 
 @dataclass(frozen=True)
 class Claim:
-    """The right to write one submission's result, or to do a job, until another scorer claims it.
-
-    Attributes:
-      id: the submission's, or the job's.
-      worker: the scorer's name.
-      attempt: number of claims of this submission, this one included.
-      seconds: how long the claim holds without a heartbeat.
-    """
+    """The right to write a submission's result, or to do a job, until another claims it."""
 
     id: str
     worker: str
@@ -106,8 +99,7 @@ class Queue:
     ) -> Claim | None:
         """Claim the next job or submission that waits, is not claimed, and is not postponed.
 
-        A claim holds for `seconds` of the machine's uptime, whatever its clock is set to;
-        `heartbeat` renews it. `worker` is the scorer's name, unique among those running.
+        It holds for `seconds` of the machine's uptime, whatever its clock is set to.
         """
         with self._store.transaction() as index:
             _end_lost(index)
@@ -137,10 +129,7 @@ class Queue:
         return True
 
     def release(self, claim: Claim, fault: str = "") -> None:
-        """Return a claim, if it is current; a fault of the machine postpones its submission.
-
-        `fault` is what readers of the board see of it.
-        """
+        """Return a claim, if it is current; a fault, which readers see, postpones it."""
         with self._store.transaction() as index:
             if _is_current(index, claim):
                 _end(index, claim.id, fault=fault)

@@ -42,7 +42,8 @@ from leaderboard.documents.submission import Submission, Withdrawal
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.gate.isolation import Isolation, available_isolation
 from leaderboard.scoring.worker import Work, background_scorers
-from leaderboard.store import Head, Store, unknown_submission
+from leaderboard.store import Store, unknown_submission
+from leaderboard.store.log import Head
 from leaderboard.web import server
 from leaderboard.web.client import public_view
 from leaderboard.web.pages import Pages, Section, content_type
@@ -273,9 +274,8 @@ class _CachedFile(NamedTuple):
 class _PageCache:
     """Rendered files, discarded when the log grows, the queue changes or a scoring fails.
 
-    At most 256 files of together 64 MiB are kept, those that were used last. One thread uses it
-    at a time: rendering is bound by Python, and clients that ask at once for a page that is not
-    cached wait for one rendering of it.
+    One thread uses it at a time: rendering is bound by Python, and clients that ask at once for a
+    page that is not cached wait for one rendering of it.
     """
 
     def __init__(self, store: Store, url: str, sections: Sequence[Section]) -> None:

@@ -28,14 +28,25 @@ from leaderboard.admission import upload_header
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.result import (
+    EntryRow,
     Result,
 )
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.errors import CODES, BoardError, NotPublishable, Rejection
 from leaderboard.scoring import ranking
-from leaderboard.store import EMPTY, EntryRow, Head, Log, LogEntry, Objects, Store, digest_of
-from leaderboard.store.log import unwritable, write_document, write_file
+from leaderboard.store import Store
+from leaderboard.store.log import (
+    EMPTY,
+    Head,
+    Log,
+    LogEntry,
+    Objects,
+    digest_of,
+    unwritable,
+    write_document,
+    write_file,
+)
 from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
 from sme_registry.io import parse_json, server_address, sha256_of
 from sme_registry.seasons.wire import Connection
@@ -64,8 +75,7 @@ def submit(
     """Send a bundle's folder to a board, and return the submission's id; it is scored later.
 
     `key`, the submitter's, signs the uploads, and the submission if it is signed for no board yet.
-    `progress` gets the number of artefacts on the board and of all. `insecure` allows plain http to
-    other machines, in a network that you trust.
+    `insecure` allows plain http to other machines, in a network that you trust.
     """
     content = Bundle.read(bundle)
     runs = content.signed.content.runs
@@ -87,10 +97,7 @@ def page_of(url: str, id: str) -> str:
 
 
 def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
-    """A submission's `id`, `status` and, once it is scored, `result`, as the board answers.
-
-    While the board withholds scores, the result is None and `withheld` has the reason.
-    """
+    """A submission as the board answers: with its `result`, or why it is `withheld`."""
     with ServedBoard(url, insecure=insecure) as served:
         answer = served.request("GET", f"/api/submissions/{_digits(id)}")
     return answer_for(f"sha256:{_digits(id)}", answer, url)
@@ -114,12 +121,9 @@ def withdraw(
 
 
 class ServedBoard:
-    """A served board, whose errors are those of this module's functions; a context manager.
+    """A served board, whose errors are those of this module; a context manager."""
 
-    Digests identify objects and documents, so that every request is safe to repeat.
-    """
-
-    def __init__(self, url: str, *, insecure: bool) -> None:
+    def __init__(self, url: str, *, insecure: bool = False) -> None:
         self.url = url
         self._address = server_address(url, insecure=insecure).url
         self._connection = Connection(url, insecure=insecure, patience=_PATIENCE)
@@ -247,8 +251,7 @@ def fetch(
 ) -> Fetched:
     """Copy the public part of a served board into a new folder, or into an earlier copy of it.
 
-    `most` bytes are downloaded, without the data sets of seasons if asked. `parts` is what else to
-    copy, such as the files of seasons; `progress` is called with what is fetched next. A
+    At most `most` bytes are downloaded. `parts` is what else to copy, such as files of seasons. A
     TamperedError is raised if the log is not signed by the board or has a gap, and a BoardError for
     everything else that the server must not send, or if the folder holds something else.
     """

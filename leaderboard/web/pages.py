@@ -25,13 +25,13 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import METRICS, RANKED, Estimate, Metric, Result
+from leaderboard.documents.result import METRICS, RANKED, EntryRow, Estimate, Metric, Result
 from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import CODES, NotPublishable
 from leaderboard.gate import networks
 from leaderboard.scoring import ranking
-from leaderboard.store import EntryRow, Store
+from leaderboard.store import Store
 from leaderboard.web import tables
 from leaderboard.web.tables import SHORT
 from sme_registry import SMESpec
@@ -54,13 +54,7 @@ _NEED_SCORES = (*(tab.page for tab in RANKED.values()), "compare.html")
 
 
 class Section(NamedTuple):
-    """Further pages of a site: those of a track.
-
-    Attributes:
-      link: address and text of the link to them, which every page has if the address is a page.
-      folder: with their `templates` and `static` files.
-      files: functions that render them, by their paths.
-    """
+    """Further pages of a site: those of a track."""
 
     link: tuple[str, str]
     folder: Path
@@ -70,8 +64,7 @@ class Section(NamedTuple):
 class Pages:
     """The pages of a board in its present state. Create another when its log has grown.
 
-    `address` is the URL at which the board accepts submissions; None for a copy that accepts none.
-    Explorers take a second each, so a server has none.
+    `address` is where the board accepts submissions; None for a copy that accepts none.
     """
 
     def __init__(
@@ -194,10 +187,7 @@ class Pages:
         )
 
     def preparation(self, root: str = "") -> str:
-        """The page of a board whose reference rows wait, which reloads itself.
-
-        `root` is the path from the page's folder to the top one.
-        """
+        """The page of a board whose reference rows wait, which reloads itself."""
         here = "" if root else "index.html"
         overview = self._overview
         return self.render("preparing.html", here=here, root=root, title="Preparing", **overview)

@@ -275,9 +275,8 @@ def write_site(
 ) -> Path:
     """Write the board's pages into a folder, and return the path of `index.html`.
 
-    Each file is written completely or not at all. The same board gives the same bytes. Unchanged
-    files and other files are left alone. Explorers, of each run of each scored submission, have
-    60 kB or more and take a second each.
+    The same board gives the same bytes. Unchanged files and other files are left alone. Explorers,
+    of each run of each scored submission, have 60 kB or more and take a second each.
     """
     out = Path(out)
     _refuse_board(out)

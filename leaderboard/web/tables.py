@@ -21,6 +21,7 @@ from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.result import (
     METRICS,
     RANKED,
+    EntryRow,
     Estimate,
     Metric,
     Result,
@@ -28,7 +29,6 @@ from leaderboard.documents.result import (
 )
 from leaderboard.documents.submission import Run, Submission, skeleton
 from leaderboard.scoring.ranking import RankedRow, class_mean, groups_of, never_listed
-from leaderboard.store import EntryRow
 from sme_registry import SMESpec
 from sme_registry.io import visible
 from sme_registry.io.markup import escape_latex
@@ -325,10 +325,7 @@ class Scale:
 
 
 class Bars:
-    """The bars of a table on one scale, with lines at the reference rows.
-
-    Hidden from screen readers, because the same numbers are in the next cell.
-    """
+    """The bars of a table on one scale, which the next cell has as numbers for screen readers."""
 
     def __init__(self, estimates: Sequence[Estimate], references: Mapping[str, float]) -> None:
         ends = (end for each in estimates for end in each.ends)

@@ -13,11 +13,12 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from leaderboard.cli import app
+from leaderboard.cli import admin, app
 from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import SigningKey
 from leaderboard.gate import isolation
+from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 from sme_registry.io import sha256_of
@@ -77,7 +78,13 @@ def _home(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+    monkeypatch.setattr(admin, "run_scorers", scored_here)
     furnish(tmp_path)
+
+
+def scored_here(board, workers, *, isolation, work, progress):
+    """Without processes, each of which takes seconds to start; `scored_folder` has them."""
+    run_scorer(board, isolation=isolation, work=work)
 
 
 @pytest.fixture(scope="module")

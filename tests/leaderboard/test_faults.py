@@ -10,14 +10,14 @@ from pathlib import Path
 from leaderboard.documents.signed import Receiver
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
-from leaderboard.store import collect_garbage
+from leaderboard.store.log import collect_garbage
 from tests.leaderboard.conftest import derived, put_submission, tiny_board
 from tests.leaderboard.store.synthetic import synthetic_result
 
-SUBMISSIONS, SCORERS, KILLS = 40, 2, 4
+SUBMISSIONS, SCORERS, KILLS = 24, 2, 4
 # One in so many has a policy, whose sandbox takes a moment to start. The others have none, and are
 # refused for it.
-REAL = 10
+REAL = 8
 
 
 class Killer(threading.Thread):

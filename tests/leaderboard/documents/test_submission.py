@@ -19,7 +19,7 @@ from leaderboard.documents.signed import (
 )
 from leaderboard.documents.submission import MAX_ENTRIES, Submission
 from leaderboard.errors import Rejection
-from leaderboard.store import LogEntry
+from leaderboard.store.log import LogEntry
 from sme_registry.spec.document import Document
 from tests.leaderboard.conftest import tiny_submission
 

@@ -11,7 +11,8 @@ from leaderboard.documents.board import Folder
 from leaderboard.documents.signed import SigningKey
 from leaderboard.scoring.ranking import never_listed, result_of
 from leaderboard.scoring.worker import run_scorer
-from leaderboard.store import LogEntry, Objects, Store
+from leaderboard.store import Store
+from leaderboard.store.log import LogEntry, Objects
 from sme_registry.io import to_json
 from tests.leaderboard.conftest import (
     linear_onnx,

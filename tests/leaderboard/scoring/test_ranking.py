@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from leaderboard.documents.result import Estimate, Scores
+from leaderboard.documents.result import Copies, EntryRow, Estimate, Scores
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable, superseded
-from leaderboard.store import Copies, EntryRow
 from leaderboard.web.tables import RankingFile
 from tests.leaderboard.conftest import document_of, tiny_suite
 

@@ -15,7 +15,8 @@ from leaderboard.scoring.ranking import levels_of, ranking, refuse_unpublishable
 from leaderboard.scoring.score import evaluation_seed
 from leaderboard.scoring.verify import Difference, Note, Row, difference, draw, verify
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.store import LogEntry, Objects, Store
+from leaderboard.store import Store
+from leaderboard.store.log import LogEntry, Objects
 from sme_registry.errors import OptionError
 from sme_registry.io import to_json
 from tests.leaderboard.conftest import EXAMPLE, SEASONS, document_path

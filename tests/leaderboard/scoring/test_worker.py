@@ -20,7 +20,8 @@ from leaderboard.scoring import worker as scorer
 from leaderboard.scoring.ranking import failed_run, refuse_unpublishable, result_of
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import background_scorers, run_scorer, run_scorers
-from leaderboard.store import Queue, Store
+from leaderboard.store import Store
+from leaderboard.store.queue import Queue
 from sme_registry.errors import MissingDependencyError, OptionError
 from tests.leaderboard.conftest import (
     document_path,

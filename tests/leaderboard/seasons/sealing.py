@@ -5,6 +5,7 @@ import datetime
 from leaderboard.documents.signed import Receiver
 from leaderboard.documents.submission import now, utc
 from leaderboard.scoring.ranking import failed_run
+from leaderboard.scoring.verify import Findings
 from leaderboard.seasons.publication import verify_seasons
 from leaderboard.seasons.scoring import sealed_result
 from leaderboard.seasons.season import Entry, Master, Stepping, Terms, TicketRequest
@@ -95,7 +96,15 @@ def signed_request(store, season, key, nonce=0, **fields):
     return TicketRequest.from_dict(plain).signed(key, Receiver(store.document.key))
 
 
+def findings_of(store, published=()):
+    """What `verify` finds of the seasons."""
+    findings = Findings(lambda what: None)
+    verify_seasons(store, findings, published)
+    return findings
+
+
 def replayed(store, published=()):
-    """What `verify` finds of the seasons: counts by what was checked, and notes."""
-    rows, notes = verify_seasons(store, lambda what: None, published)
-    return {row.what.partition(": ")[2]: (row.checked, row.unchecked) for row in rows}, notes
+    """Of one season: counts by what was checked, and notes."""
+    findings = findings_of(store, published)
+    counts = {row.what.partition(": ")[2]: (row.checked, row.unchecked) for row in findings.rows}
+    return counts, findings.notes

@@ -6,7 +6,8 @@ import pytest
 
 from leaderboard.errors import BoardError
 from leaderboard.scoring.verify import verify
-from leaderboard.store import Store, collect_garbage
+from leaderboard.store import Store
+from leaderboard.store.log import collect_garbage
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import (
     linear_onnx,

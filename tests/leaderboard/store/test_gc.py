@@ -5,8 +5,8 @@ import pytest
 
 from leaderboard import admission
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.store import Store, collect_garbage
-from leaderboard.store.log import Objects
+from leaderboard.store import Store
+from leaderboard.store.log import Objects, collect_garbage
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_submission
 

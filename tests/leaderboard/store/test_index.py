@@ -8,7 +8,9 @@ import pytest
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
-from leaderboard.store import Index, Store, collect_garbage
+from leaderboard.store import Store
+from leaderboard.store.index import Index
+from leaderboard.store.log import collect_garbage
 from tests.leaderboard.conftest import (
     derived,
     put_submission,

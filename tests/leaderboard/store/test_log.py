@@ -3,7 +3,8 @@ import pytest
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
-from leaderboard.store import LogEntry, Store
+from leaderboard.store import Store
+from leaderboard.store.log import LogEntry
 from sme_registry.errors import SpecError
 from tests.leaderboard.clocks import move_clock
 from tests.leaderboard.conftest import put_submission, tiny_board

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from leaderboard import admission
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import Estimate
+from leaderboard.documents.result import Copies, Estimate
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.store import Copies, Store
+from leaderboard.store import Store
 from leaderboard.web import pages as site_pages
 from leaderboard.web import tables
 from leaderboard.web.pages import Pages, content_type
