@@ -38,6 +38,7 @@ from sme_registry.studies.report.design import (
     TASKS,
     WITHIN,
     axis_label,
+    setting_label,
 )
 from sme_registry.studies.report.frames import frame
 from sme_registry.studies.report.texts import implementation_caveats
@@ -154,26 +155,46 @@ def _task(analysis: Analysis, name: str) -> Found:
                 row,
             )  # fmt: skip
     contrasts = _rows(analysis.tables["contrasts"], **place)
-    contrasts.sort(key=lambda row: (_direction(row) != "worse", -row.change))
+    order = {
+        "worse": "is higher", "better": "is lower", "open": "was shown neither higher nor lower"
+    }  # fmt: skip
+    by_change = sorted(contrasts, key=lambda row: -row.change)
+    contrasts = [
+        *(row for row in by_change if _direction(row) == "worse"),
+        *(row for row in reversed(by_change) if _direction(row) == "better"),
+        *(row for row in by_change if _direction(row) == "open"),
+    ]
     largest = {row.axis or row.class_name: row for row in reversed(contrasts)}
     for row in reversed(largest.values()):
-        verb = {"worse": "is higher", "better": "is lower", "open": "was not shown to be higher"}
         yield finding(
             "tasks", "axis", _of_few(_direction(row), row.pairs),
-            f"Its WD regret {verb[_direction(row)]} with {_property(analysis, row)}: on "
-            f"{row.class_name} by {_change(row)}.",
+            f"Its WD regret {order[_direction(row)]} {_where(analysis, row)}: {_change(row)}.",
             row,
         )  # fmt: skip
     yield from _worst(analysis, name, "ood_regret")
 
 
 def _worst(analysis: Analysis, name: str, metric: str) -> Found:
-    """The largest change of a kind of regret that is shown, and whether others may be larger."""
+    """The largest rise of a kind of regret that is shown, and whether others may be larger.
+
+    Without one, the largest fall.
+    """
     regret = METRICS[metric].label
     contrasts = _rows(analysis.tables["contrasts"], algorithm=name, metric=metric)
     worse = [row for row in contrasts if _direction(row) == "worse"]
+    better = [row for row in contrasts if _direction(row) == "better"]
+    if not worse and better:
+        best = min(better, key=lambda row: row.change)
+        yield finding(
+            "tasks", f"worst {regret}", _of_few("easier", best.pairs),
+            f"The {regret} of {name} falls most {_where(analysis, best)}: from {fixed(best.base)} "
+            f"on {analysis.base} to {fixed(best.level)}, by {_change(best)}. No class was shown to "
+            "raise it.",
+            best,
+        )  # fmt: skip
+        return
     if not worse:
-        text = f"No class was shown to raise the {regret} of {name}"
+        text = f"No class was shown to change the {regret} of {name}"
         text += f" from that on {analysis.base}, which does not show that none does."
         yield finding("tasks", f"worst {regret}", "none_shown", text, algorithm=name)
         return
@@ -206,17 +227,18 @@ def _comparison(analysis: Analysis) -> Found:
     best: dict[str, Any] = {}
     for source in dict.fromkeys(data[row.algorithm] for row in learners):
         alike = [row for row in learners if data[row.algorithm] == source]
-        row = max(alike, key=lambda row: row.value)
+        row = max(alike, key=lambda row: row.value)  # of 1 − regret
         if len(alike) > 1:
-            best[row.algorithm] = row
+            regret = {"value": 1 - row.value, "low": 1 - row.high, "high": 1 - row.low}
+            best[row.algorithm] = row._replace(**regret)
     for name, row in best.items():
         source = data[name]
         of_data = f" of those with data of ν = {source[0]:g}" if source else ""
         yield finding(
             "comparison", "best", "best",
             f"Over the {plural(row.classes, 'class', 'classes')} on which all have runs, {name} is "
-            f"best within distribution{of_data}: {fixed(row.value)} {_interval(row)}, where 1 is "
-            "the optimum and 0 the constant ½.",
+            f"best within distribution{of_data}: its WD regret is {fixed(row.value)} "
+            f"{_interval(row)}, where 0 is the optimum and 1 the constant ½.",
             row,
         )  # fmt: skip
     for row in _rows(analysis.tables["improvements"], **over_all):
@@ -403,6 +425,16 @@ def _property(analysis: Analysis, contrast: Any) -> str:
     if contrast.axis == SEVERAL:
         return f"several axes at once ({analysis.classes[contrast.class_name].label})"
     return axis_label(contrast.axis) or f"the class {contrast.class_name}"
+
+
+def _where(analysis: Analysis, contrast: Any) -> str:
+    """The class of a contrast by its value: `where minimum reward r_min is 0 (class r_min-0)`."""
+    name, axis = contrast.class_name, contrast.axis
+    info = analysis.classes[name]
+    if axis not in info.setting:
+        return f"on {name} ({info.label})" if info.label else f"on {name}"
+    value = setting_label(axis, info.setting[axis], with_symbol=False)
+    return f"where {axis_label(axis)} is {value} (class {name})"
 
 
 def _side(row: Any, runs: int, neutral: float) -> str:

@@ -60,8 +60,21 @@ def test_every_axis_has_a_verdict_those_that_hurt_first(analysis):
     assert list(zip(rows.class_name, rows.verdict, strict=True)) == [
         ("r_min-0_5", "worse"), ("k-25", "worse"), ("complexity-10", "open"), ("plane", "open"),
     ]  # fmt: skip
-    lower = contrasted(analysis, "plane", {"change": -0.3, "low": -0.4, "high": -0.2})
-    assert of_alpha(lower)["axis"].verdict == "better"  # the last one
+
+
+def test_a_lower_regret_is_told_by_the_value_of_the_field_and_makes_the_headline(analysis):
+    fields = {"change": -0.3, "low": -0.4, "high": -0.2}
+    lower = contrasted(analysis, "r_min-0_5", fields)
+    for name in ("k-25", "complexity-10", "plane"):
+        lower = contrasted(lower, name, {"change": 0.0, "low": -0.1, "high": 0.1})
+    rows = findings(lower)
+    of_axes = rows[(rows.algorithm == "Alpha") & (rows.question == "axis")]
+    assert [*of_axes.verdict] == ["better", "open", "open", "open"]
+    where = "where minimum reward r_min is 0.5 (class r_min-0_5): "
+    assert of_axes.sentence.iloc[0].startswith(f"Its WD regret is lower {where}−0.30 (")
+    headline = of_alpha(lower)["worst WD regret"]
+    assert (headline.verdict, headline.class_name) == ("easier", "r_min-0_5")
+    assert headline.sentence.startswith(f"The WD regret of Alpha falls most {where}from 0.")
 
 
 def test_larger_changes_that_are_open_are_rivals_of_the_worst(analysis):
@@ -128,7 +141,10 @@ def test_severity_is_the_size_of_the_largest_change(analysis, change, verdict):
      ((0.1, 0.2, 5), "below")],
 )  # fmt: skip
 def test_an_improvement_is_judged_by_its_interval_against_a_half(analysis, ends, verdict):
-    assert found(analysis, section="comparison")["best"].algorithm in analysis.learners
+    best = found(analysis, section="comparison")["best"]
+    assert best.algorithm in analysis.learners
+    assert 0 <= best.low <= best.value <= best.high
+    assert f"its WD regret is {best.value:.2f} (95 % interval {best.low:.2f}" in best.sentence
     rows = analysis.tables["improvements"]
     rows = rows.assign(**dict(zip(("low", "high", "fewest_runs"), ends, strict=True)))
     row = found(with_tables(analysis, improvements=rows), section="comparison")["improvement"]

@@ -156,7 +156,7 @@ def test_results_and_curves_hold_single_tasks_alone(study, tmp_path):
     assert set(studies.load_streams(tmp_path).lives.class_name) == {"Related"}
     text = text_of(analysed(tmp_path))
     assert "1 class and 1 stream × 1 algorithm × 1 seed: 5 of 5 runs have finished" in text
-    assert "No class was shown to raise the WD regret of Alpha" in text
+    assert "No class was shown to change the WD regret of Alpha" in text
     assert "Alpha was not shown to forget" in text
     with pytest.raises(OptionError, match=r"has streams alone.*sme study report"):
         studies.compare(study, "Tired", "Stubborn")
