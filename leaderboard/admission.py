@@ -21,7 +21,7 @@ import datetime
 import os
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from leaderboard.bundle import Bundle
@@ -183,10 +183,7 @@ def admit(
         check_entrant(store, submission.submitter, len(signed.to_bytes()))
         if key != store.document.key:
             _check_queue(store)
-        for digest, declared in _policies(submission).items():  # nor can `gc` take a file
-            if policy_file is not None:
-                store.put_object(digest, policy_file(digest), by=key)
-            check_stored(store, key, declared)
+        store_files(store, key, _policies(submission), policy_file)  # nor can `gc` take one
         return store.receive(signed)
 
 
@@ -304,9 +301,11 @@ def _check_queue(store: Store) -> None:
         )
 
 
-def _policies(submission: Submission) -> dict[str, Artefact]:
-    """Each distinct policy file, by its digest, in the order of the runs."""
-    return {run.artefact.sha256: run.artefact for run in submission.runs if run.artefact}
+def _policies(submission: Submission) -> list[Artefact]:
+    """Each distinct policy file, in the order of the runs."""
+    return list(
+        {run.artefact.sha256: run.artefact for run in submission.runs if run.artefact}.values()
+    )
 
 
 def _check_files(
@@ -317,8 +316,7 @@ def _check_files(
 ) -> None:
     """Check that all are present with the declared sizes; then inspect one after the other."""
     if policy_file is None:
-        for declared in _policies(submission).values():
-            check_stored(store, submission.submitter.key, declared)
+        store_files(store, submission.submitter.key, _policies(submission), None)
     instances = store.document.instances
     cases = dict.fromkeys(
         (run.artefact.sha256, *widths(instances[run.spec][1]))
@@ -345,6 +343,16 @@ def _inspect(read: ReadFile, cases: list[_Case], isolation: Isolation | None) ->
     for case in cases:
         if (verdict := _verdicts.get(case)) is not None:
             raise Rejection(verdict.code, verdict.message)
+
+
+def store_files(
+    store: Store, key: str, declared: Iterable[Artefact], read: ReadFile | None
+) -> None:
+    """Store the files that an entrant names, or check that its key has uploaded them."""
+    for each in declared:
+        if read is not None:
+            store.put_object(each.sha256, read(each.sha256), by=key)
+        check_stored(store, key, each)
 
 
 def check_stored(store: Store, key: str, declared: Artefact) -> None:

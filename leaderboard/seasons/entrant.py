@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import re
 import secrets
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,7 +33,6 @@ from leaderboard.seasons.publication import name_of, read_season
 from leaderboard.seasons.scoring import enter as enter_folder
 from leaderboard.seasons.season import Entry, Season, TicketRequest
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.web.client import Progress as Sent
 from leaderboard.web.client import ServedBoard
 from sme_registry.errors import OptionError, SpecError
 from sme_registry.io import (
@@ -341,8 +340,12 @@ def enter(
     )
     signed = entry.signed(signing_key, receiver_of(board))
     if is_url(board):
-        with Progress("uploading", len(data), console=err(), unit="answers") as progress:
-            send_entry(board, season.id, signed, data, signing_key, progress.update_of)
+        path, answers = f"/api/seasons/{season.id}/entries", data.__getitem__
+        with (
+            Progress("uploading", len(data), console=err(), unit="answers") as progress,
+            ServedBoard(board) as served,
+        ):
+            served.send(path, signed, data, answers, signing_key, progress.update_of)
     else:
         with SeasonStore.open(Path(board)) as store:
             enter_folder(store, signed, answers=data.__getitem__)
@@ -391,20 +394,6 @@ def request_ticket(url: str, season: str, signed: Signed[TicketRequest], key: Si
     except SpecError as error:
         raise BoardError(f"{url}: answered with no ticket: {error}") from None
     return ticket.model_copy(update={"signer": signer_of(signed, key)})
-
-
-def send_entry(
-    url: str,
-    season: str,
-    signed: Signed[Entry],
-    answers: Mapping[str, bytes],
-    key: SigningKey,
-    progress: Sent,
-) -> None:
-    """Send an entry of a sealed-offline season, and first the files that it names, by digest."""
-    with ServedBoard(url) as served:
-        path = f"/api/seasons/{season}/entries"
-        served.send(path, signed, answers, answers.__getitem__, key, progress)
 
 
 def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:

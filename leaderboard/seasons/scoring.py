@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from leaderboard.admission import ReadFile, check_entrant, check_manifest, check_stored
+from leaderboard.admission import ReadFile, check_entrant, check_manifest, check_stored, store_files
 from leaderboard.documents.board import RULES, check_receiver
 from leaderboard.documents.result import EntryRow, Metric, RunScore, Scores
 from leaderboard.documents.signed import Signed
@@ -372,10 +372,7 @@ def enter(
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
         check_entrant(store, entry.submitter, len(signed.to_bytes()))
         _check_newest(store, season, entry)
-        for answer in given:
-            if answers is not None:
-                store.put_object(answer.sha256, answers(answer.sha256), by=key)
-            check_stored(store, key, answer)
+        store_files(store, key, given, answers)
         return store.add("entry", signed)[1]
 
 

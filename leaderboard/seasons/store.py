@@ -452,7 +452,7 @@ class SeasonStore(Store):
         with self.transaction() as index:
             row = self.season_row(season)
             admitted = Admitted.from_dict({"season": row.digest, "key": key, "name": name})
-            if key in Seasons(index).admitted(row.digest):
+            if row.reveal is None and key in Seasons(index).admitted(row.digest):
                 return False
             self.record("admitted", row.digest, admitted)
         return True

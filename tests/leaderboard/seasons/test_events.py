@@ -138,6 +138,8 @@ def test_a_reveal_follows_the_close_and_the_tickets_and_matches(store, key, late
     assert not store.reveal(reveal(season))
     with pytest.raises(Rejection, match="season_revealed"):
         store.add("ticket", signed_request(store, season, key, 2))
+    with pytest.raises(Rejection, match="season_revealed"):
+        store.admit(season.id, key.public, "A Lab")
 
 
 def test_no_reveal_tells_the_tasks_of_another_season_that_is_not_over(store, key, later):
