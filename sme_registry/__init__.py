@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from sme_registry.datasets import make_dataset, train_offline
     from sme_registry.diagnosis import diagnose
     from sme_registry.evaluation import EvaluationReport, StreamReport, evaluate
-    from sme_registry.evaluation.values import values
+    from sme_registry.evaluation.rollouts import values
     from sme_registry.export import export_onnx
     from sme_registry.profiles.document import Profile
     from sme_registry.profiles.run import profile
@@ -107,7 +107,7 @@ _LAZY = {
     "save": "sme_registry.task.loading.save",
     "train": "sme_registry.training.train",
     "train_offline": "sme_registry.datasets.train_offline",
-    "values": "sme_registry.evaluation.values.values",
+    "values": "sme_registry.evaluation.rollouts.values",
 }
 
 # Not in `__all__`: a star import would load all of them, and with them optional dependencies.

@@ -32,7 +32,7 @@ from sme_registry.datasets.storage import is_sealed
 from sme_registry.diagnosis import load_run
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.evaluation.evaluate import resolve_protocol
-from sme_registry.io import check_new
+from sme_registry.io import check_new, read_json
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import Progress, count, err, print_line, print_note
 from sme_registry.spec import (
@@ -169,7 +169,7 @@ class Settings:
         flat = {name: value for name, value in values.items() if name not in fields}
         settings = algorithms.nested_hyperparameters(flat)
         path = self.hyperparameters
-        from_file = {} if path is None else algorithms.read_hyperparameters(path)
+        from_file = {} if path is None else _read_hyperparameters(path)
         for name in settings.keys() & from_file.keys():
             raise OptionError(f"--set {name}: {path} sets it, too. Remove one.")
         return fields, {**from_file, **settings}
@@ -391,6 +391,16 @@ def _next_step(suite: Suite, plan: StudyPlan, folder: Path) -> str:
     if plan.seeds < instances:
         return f"A leaderboard needs a run on every instance: use --seeds {instances} or more."
     return f"To submit them: sme-leaderboard submit {folder} BOARD --method NAME --submitter NAME"
+
+
+def _read_hyperparameters(path: Path) -> dict[str, Any]:
+    values = read_json(path)
+    if not isinstance(values, dict):
+        raise OptionError(
+            f"{path}: must be an object of hyperparameters, such as "
+            '{"learning_rate": 0.0001, "policy_kwargs": {"net_arch": [64, 64]}}.'
+        )
+    return algorithms.nested_hyperparameters(values)
 
 
 def equal_runs(suite: Suite) -> int:

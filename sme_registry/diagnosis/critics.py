@@ -23,8 +23,7 @@ from sme_registry.errors import PolicyError
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.models import evaluating, load_sb3
 from sme_registry.evaluation.networks import OfflineCritic, OfflinePolicy
-from sme_registry.evaluation.rollouts import play
-from sme_registry.evaluation.values import expected_returns, value_after_end
+from sme_registry.evaluation.rollouts import expected_returns, play, value_after_end
 from sme_registry.io import integer_in
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf

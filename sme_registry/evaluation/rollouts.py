@@ -1,17 +1,24 @@
-"""`play`, the loop of a policy in a batch, and `rollouts`, thousands of whole episodes."""
+"""`play`, the loop of a policy in a batch; `rollouts`, thousands of whole episodes; and `values`,
+exact values of a policy (METHOD, section 11), which are means of these.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs.arguments import single_agent
+from sme_registry.envs.arguments import initial_states, single_agent
 from sme_registry.envs.batch import Batch, BatchStep
-from sme_registry.evaluation.policies import Policy, TeamPolicy
+from sme_registry.errors import OptionError, StateError
+from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
+from sme_registry.io import choice, integer_in, number_in
+from sme_registry.spec import SMESpec
+from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import Task, draw
+from sme_registry.task.loading import load_task
 from sme_registry.task.task import (
     REGRET,
     REWARD,
@@ -24,6 +31,10 @@ from sme_registry.task.task import (
 
 MOST_ENVS = 4096
 """Most episodes in parallel, so that memory does not grow with their number."""
+
+Horizon = Literal["finite", "continuing"]
+_TAILS = 64  # roll-outs from the end of an episode on
+_NEGLIGIBLE = 0.01  # weight of the first reward that a tail leaves out
 
 
 class PlayStep(NamedTuple):
@@ -163,3 +174,181 @@ class _Acting:
 def _team_means(values: Array) -> Array:
     """Means over agents, `[rows, n, B]` to `[rows, B]`; without a sum for a single agent."""
     return values[:, 0] if values.shape[1] == 1 else np.asarray(values.mean(axis=1))
+
+
+def values(
+    task: SpecLike | Task,
+    policy: Any,
+    states: npt.ArrayLike,
+    *,
+    gamma: float,
+    t: npt.ArrayLike = 0,
+    accumulated: npt.ArrayLike = 0.0,
+    distractors: npt.ArrayLike | None = None,
+    actions: npt.ArrayLike | None = None,
+    horizon: Horizon = "finite",
+    samples: int = 1,
+    seed: int = 0,
+) -> Array:
+    """The exact value `[B]` of a policy at each of some states: what a critic should say.
+
+    The discounted rewards that the agent is paid, shaping and noise included, to the end of the
+    episode. METHOD, section 11. For a stream give the task of a phase, such as `phase.spec`.
+
+    Args:
+      policy: as in `evaluate`; one that samples its actions is averaged over `samples`.
+      states: `[B, S]`, also outside the cube.
+      gamma: discount in [0, 1].
+      t: steps before each state, `[B]` or one number, in [0, T).
+      accumulated: r_cum before each state, `[B]` or one number, in [0, k].
+      distractors: `[B, m]`, by default drawn from `seed`.
+      actions: first actions `[B, A]` of the unit range, for a value of actions (Q); by default
+        the policy's.
+      horizon: "continuing" adds γ^(T − t) times the mean value of going on after the end without
+        shaping, with t/T held at 1: what an agent that bootstraps at a truncation estimates.
+      samples: roll-outs from each state, which a stochastic policy or noise needs.
+      seed: of distractors, noise and the states that a continuing value goes on from.
+
+    Example:
+      >>> states = np.full((2, 8), 0.5)
+      >>> sme_registry.values("Default", "optimal", states, gamma=1.0, t=[0, 90])
+      array([100.,  10.])
+    """
+    task = single_agent(task if isinstance(task, Task) else load_task(task))
+    spec = task.spec
+    choice("horizon", horizon, ("finite", "continuing"))
+    integer_in("samples", samples, 1)
+    integer_in("seed", seed, 0)
+    number_in("gamma", gamma, 0.0, 1.0)
+    if gamma == 1 and horizon == "continuing":
+        raise OptionError(
+            'horizon="continuing": without an end and with gamma=1, values are infinite. Use '
+            'horizon="finite", or gamma below 1.'
+        )
+    s = _states(states, spec.state_dim)
+    B = len(s)
+    steps = _each("t", t, B, 0, spec.horizon - 1, whole=True).astype(np.int64)
+    r_cum = _each("accumulated", accumulated, B, 0.0, spec.k)
+    d = _rows("distractors", distractors, (B, spec.distractors))
+    first = _rows("actions", actions, (B, spec.action_dim))
+    if policy == "optimal" and first is None and horizon == "finite" and _has_formula(spec, gamma):
+        return _of_optimum(task, s, steps, gamma)
+    acting = as_policy(policy, spec)
+    returns = expected_returns(
+        task, acting, s, t=steps, gamma=gamma, samples=samples, seed=seed,
+        r_cum=r_cum, distractors=d, actions=first,
+    )  # fmt: skip
+    if horizon == "finite":
+        return returns.finite
+    return returns.finite + returns.left * value_after_end(task, acting, gamma, seed)
+
+
+class Returns(NamedTuple):
+    """Mean returns `[B]` to the end of the episode, and the discount there."""
+
+    finite: Array
+    left: Array  # γ^(T − t), 0 of episodes that D ends before
+
+    @classmethod
+    def of(cls, runs: Rollouts, steps: npt.NDArray[np.int64], gamma: float) -> Returns:
+        """Those of episodes that had so many `steps` to go."""
+        ended = runs.length < steps
+        return cls(runs.discounted_return, np.where(ended, 0.0, gamma**steps))
+
+
+def expected_returns(
+    task: Task,
+    policy: Callable[[Observation], Any],
+    s: Array,
+    *,
+    t: npt.NDArray[np.int64],
+    gamma: float,
+    samples: int = 1,
+    seed: int = 0,
+    **begun: Array | None,
+) -> Returns:
+    """`values` of checked arguments; `begun` are r_cum, distractors and first actions."""
+    runs = (
+        Returns.of(
+            rollouts(policy, task, s, t=t, gamma=gamma, seed=seed + i, **begun),
+            task.spec.horizon - t,
+            gamma,
+        )
+        for i in range(samples)
+    )
+    return Returns(*(np.mean(parts, axis=0) for parts in zip(*runs, strict=True)))
+
+
+def _has_formula(spec: SMESpec, gamma: float) -> bool:
+    telescopes = spec.shaping is None or gamma == spec.shaping.discount == 1
+    return spec.k == 1 and spec.D < 1 and not spec.compensated and telescopes
+
+
+def _of_optimum(task: Task, s: Array, t: npt.NDArray[np.int64], gamma: float) -> Array:
+    left = task.spec.horizon - t
+    if gamma == 1:
+        return np.asarray(left - task.potential(s, t))
+    return np.asarray((1 - gamma**left) / (1 - gamma))
+
+
+def value_after_end(
+    task: Task, policy: Callable[[Observation], Any], gamma: float, seed: int
+) -> float:
+    """V̄_T: the mean value of going on for ever from uniform states, with t/T held at 1."""
+    steps = 1 if gamma == 0 else max(1, int(np.ceil(np.log(_NEGLIGIBLE) / np.log(gamma))))
+    # Neither changes what is drawn, only how long an episode is, and that P = 0.
+    spec = task.spec.derive(horizon=steps, shaping=None)
+    s = draw.uniform(seed, "values/tail", _TAILS * spec.state_dim).reshape(_TAILS, -1)
+    at_end = _AtEnd(policy, spec.state_dim + spec.distractors)
+    tail = rollouts(at_end, load_task(spec), s, gamma=gamma, seed=seed)
+    return float(tail.discounted_return.mean() / (1 - gamma**steps))
+
+
+class _AtEnd:
+    """A policy that always sees t/T = 1."""
+
+    def __init__(self, policy: Callable[[Observation], Any], of_t: int) -> None:
+        self._policy = policy.start() if isinstance(policy, Policy) else policy
+        self._of_t = of_t
+
+    def __call__(self, observations: Observation) -> Any:
+        observations[:, self._of_t] = 1.0
+        return self._policy(observations)
+
+    @property
+    def bonus(self) -> Any:
+        return getattr(self._policy, "bonus", 0.0)
+
+
+def _each(
+    name: str, given: npt.ArrayLike, B: int, low: float, high: float, *, whole: bool = False
+) -> Array:
+    """A number for each state, from one or from `[B]`."""
+    numbers = _numbers(given)
+    allowed = (low <= numbers) & (numbers <= high) & (not whole or numbers == np.rint(numbers))
+    if numbers.shape not in ((), (B,)) or not allowed.all():
+        kind = "integer" if whole else "number"
+        raise OptionError(
+            f"{name}={given!r:.80}: must be one {kind} or {B}, one for each state, in "
+            f"[{low:g}, {high:g}]."
+        )
+    return np.broadcast_to(numbers, (B,)).copy()
+
+
+def _numbers(given: npt.ArrayLike) -> Array:
+    """An array of float64; NaN where it is none."""
+    try:
+        return np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        return np.array(np.nan)
+
+
+def _rows(name: str, given: npt.ArrayLike | None, shape: tuple[int, int]) -> Array | None:
+    return None if given is None else initial_states(given, shape, name)
+
+
+def _states(states: npt.ArrayLike, state_dim: int) -> Array:
+    s = _numbers(states)
+    if s.ndim != 2 or s.shape[1] != state_dim or not np.isfinite(s).all():
+        raise StateError(f"states of shape {s.shape}: must be finite, of shape [B, {state_dim}].")
+    return s

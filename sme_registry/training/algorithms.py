@@ -26,18 +26,15 @@ import io
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, create_model
-from rich.console import Console
-from rich.markup import escape
 
 from sme_registry.datasets import documents
 from sme_registry.envs.arguments import check_has_limits
 from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import OLD_NAMES, POLICIES
-from sme_registry.io import choice, import_object, read_json, require_packages
+from sme_registry.io import choice, import_object, require_packages
 from sme_registry.io.system import missing_dependency, module_file
 from sme_registry.spec import SMESpec, StreamSpec, StudyAlgorithm
 from sme_registry.spec.document import Integer, Real, StrictModel
@@ -464,17 +461,6 @@ def quiet() -> contextlib.AbstractContextManager[Any]:
 
 
 @contextlib.contextmanager
-def show_advice(console: Console) -> Iterator[None]:
-    """Print once what Stable-Baselines3 warns of hyperparameters, such as a truncated minibatch."""
-    with warnings.catch_warnings(record=True, action="always") as caught:
-        yield
-    advice = [each for each in caught if "stable_baselines3" in each.filename]
-    for text in dict.fromkeys(str(each.message) for each in advice if each.category is UserWarning):
-        message = " ".join(text.split())
-        console.print(f"[yellow]note:[/] {escape(message)}", soft_wrap=True)
-
-
-@contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Run PyTorch on one thread; the previous number is restored afterwards."""
     import torch
@@ -506,13 +492,3 @@ def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
             )
         block[last] = dict(value) if isinstance(value, Mapping) else value  # the caller's stays
     return nested
-
-
-def read_hyperparameters(path: Path) -> dict[str, Any]:
-    values = read_json(path)
-    if not isinstance(values, dict):
-        raise OptionError(
-            f"{path}: must be an object of hyperparameters, such as "
-            '{"learning_rate": 0.0001, "policy_kwargs": {"net_arch": [64, 64]}}.'
-        )
-    return nested_hyperparameters(values)

@@ -16,14 +16,17 @@ time writes the files:
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from sme_registry.envs.episodes import Episode
 from sme_registry.errors import OptionError
@@ -67,7 +70,6 @@ from sme_registry.training.algorithms import (
     nested_hyperparameters,
     quiet,
     short_name,
-    show_advice,
 )
 from sme_registry.training.functions import source_of
 from sme_registry.training.learn import Run, learn
@@ -243,7 +245,7 @@ def train(
             piece=min(100, record.checkpoint_every),
             field="algorithm",
         )
-        with show_advice(console or err()):
+        with _show_advice(console or err()):
             learner = entry.learner(run)  # rejects hyperparameters before the folder is created
         record = record.updated(hyperparameters=learner.hyperparameters)
         if record.sessions == 1:
@@ -262,6 +264,17 @@ def train(
 def default_protocol(steps: int) -> str:
     """Of the final evaluation, which should not take longer than the training."""
     return "paper-v1" if steps >= DEFAULT_STEPS else "quick-v1"
+
+
+@contextlib.contextmanager
+def _show_advice(console: Console) -> Iterator[None]:
+    """Print once what Stable-Baselines3 warns of hyperparameters, such as a truncated minibatch."""
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        yield
+    advice = [each for each in caught if "stable_baselines3" in each.filename]
+    for text in dict.fromkeys(str(each.message) for each in advice if each.category is UserWarning):
+        message = " ".join(text.split())
+        console.print(f"[yellow]note:[/] {escape(message)}", soft_wrap=True)
 
 
 def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
