@@ -303,7 +303,8 @@ def _ratio(sums: npt.NDArray[np.float64], possible: int) -> float:
     return share * (regret / half if half > 0.0 else 0.0) + 1.0 - share
 
 
-_RECORD_BYTES, _HEAD_BYTES = 12, 4096  # of a journal; heads with the signature's file
+_RECORD_BYTES = _NUMBER.size + _CRC_SIZE  # of a record, besides its actions
+_HEAD_BYTES = 4096  # of the head of a journal, with the file of the signature
 _SNAPSHOT_BYTES, _NUMBERS_OF_A_LANE = 2**14, 40  # of a snapshot; bytes of a lane, for each channel
 
 

@@ -186,7 +186,7 @@ def regrets(actions):
 
 
 @pytest.mark.parametrize(
-    ("taken", "budget", "lanes"), [(250, 250, 1), (130, 250, 1), (5, 8, 1), (130, 250, 3)]
+    ("taken", "budget", "lanes"), [(120, 120, 1), (110, 120, 1), (5, 8, 1), (110, 120, 3)]
 )
 def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(taken, budget, lanes):
     """As in single environments; steps that were not taken count like the constant's."""
