@@ -33,10 +33,11 @@ Columns of the run, repeated in each of its regions; NaN or NA where the run has
     seconds, steps_per_second    CPU time of the run, and training speed
     key                          digest of the run's cell, which names its file
 
-The fields of shaping, noise, safety and observation where a task has these. With safety:
-online_cost, the mean over training; wd_cost and wd_safe_regret, of the cube; cost, violating_share,
-safe_regret and price_of_safety, of the region. With observation: distractor_regret, the mean over
-the shells of d; wd_sensitivity, of the cube; sensitivity, of the region. The numbers of a team are
+With shaping: its scale and discount; with noise: its reward and transition. With safety: tightness
+τ of the limits, and compensated; online_cost, the mean over training; wd_cost and wd_safe_regret,
+of the cube; cost, violating_share, safe_regret and price_of_safety, of the region. With
+observation: distractors, dynamics, mixing, mixing_depth; distractor_regret, the mean over the
+shells of d; wd_sensitivity, of the cube; sensitivity, of the region. The numbers of a team are
 means over agents or channels. Those of each agent have its name: normalised_regret/agent_0 of the
 region, wd_regret, ood_regret and online_regret of the run, and in `curves` regret/agent_0.
 
@@ -60,8 +61,7 @@ of its phases have finished; `evaluation.retention` has the formulas.
     forgetting                   mean fall of performance on earlier phases below their best
     forward_transfer             mean gain on phases before their first visit
     relearning                   mean gain of the second visit of a phase on its first
-    plasticity_ratio, plasticity_difference   of the visited phase's regret to a fresh agent's, mean
-                                 over visits ≥ 1
+    plasticity_ratio, plasticity_difference   of regret to a fresh agent's, mean over visits ≥ 1
 
 Columns of the life, repeated in each of its regions; NaN where it has no such number:
 
