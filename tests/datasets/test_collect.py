@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-import sme_registry
 from sme_registry.datasets import DatasetRecipe, replay
 from sme_registry.datasets.collect import collect, noise_task
 from sme_registry.datasets.documents import parse_behaviour
@@ -72,48 +71,6 @@ def test_every_transition_is_that_of_the_task_whatever_the_size_of_the_batch(num
     replay(data, of, materialize(of.spec))
 
 
-@pytest.mark.parametrize(
-    ("fields", "nu"),
-    [({"k": 3, "D": 0.2}, 0.5), ({**DRIVEN, "k": 3}, 1.0)],
-    ids=["plain", "driven"],
-)
-def test_a_data_set_equals_the_steps_of_a_single_environment(fields, nu):
-    of = recipe(fields, [(nu, 1.0)], transitions=250)
-    data = collected(of)
-    env = sme_registry.make(of.spec)
-    of_info = {
-        "regret": data.regrets,
-        "similarity": data.similarities,
-        "optimal_action": data.optimal_actions,
-    }
-    if data.costs is not None:
-        of_info |= {
-            "limit": data.limits,
-            "safe_action": data.safe_actions,
-            "cost": data.costs,
-            "safe_regret": data.safe_regrets,
-        }
-        assert (data.costs > 0).any()
-    start = 0
-    for end in data.ends:
-        begun = {"state": data.states[start]}
-        if data.distractors is not None:
-            begun["distractors"] = data.distractors[start]
-        observation, _ = env.reset(options=begun)
-        for row in range(start, end):
-            np.testing.assert_array_equal(observation, data.observations[row])
-            if data.distractors is not None:
-                np.testing.assert_array_equal(env.unwrapped.distractors, data.distractors[row])
-            observation, reward, terminated, truncated, info = env.step(data.actions[row])
-            np.testing.assert_array_equal(observation, data.next_observations[row])
-            assert terminated == data.terminations[row]
-            assert (truncated and not terminated) == data.timeouts[row] or row == len(data) - 1
-            assert reward == data.rewards[row]
-            for name, column in of_info.items():
-                np.testing.assert_array_equal(info[name], column[row])
-        start = end
-
-
 def test_distractors_are_uniform_and_differ_between_episodes():
     data = collected(recipe({"observation": {"distractors": 4}}, transitions=5000))
     assert len(np.unique(data.distractors)) == data.distractors.size
@@ -146,32 +103,6 @@ def test_starts_alpha_and_noise_use_separate_streams_of_the_data_seed():
     assert collected(of).digest == data.digest
     other = collected(recipe(seed=6, transitions=300))
     assert not np.isin(data.states[::100, 0], other.states[:, 0]).any()
-
-
-def test_the_noise_policy_has_the_shapes_of_the_optimal_one_and_other_numbers():
-    for fields in TASKS.values():
-        task = materialize(SMESpec.from_dict(fields))
-        noise = noise_task(task, 0)  # the task's own seed, too, is 0
-        for optimal, other in zip(task.policies, noise.policies, strict=True):
-            for layer, drawn in zip(optimal, other, strict=True):
-                assert layer.W.shape == drawn.W.shape
-                assert np.abs(layer.W - drawn.W).max() > 0.1
-        np.testing.assert_array_equal(task.W, noise.W)
-
-
-def test_alpha_is_drawn_at_every_step_and_uniform_up_to_nu():
-    of = recipe(acting=[(0.4, 1.0)], transitions=5_000, seed=2)
-    data = collected(of)
-    noise = noise_task(materialize(of.spec), 2).optimal_action(data.states)
-    gap = noise - data.optimal_actions
-    widest = np.abs(gap).argmax(axis=1)[:, None]
-    moved = np.take_along_axis(data.actions - data.optimal_actions, widest, 1)
-    alpha = (moved / np.take_along_axis(gap, widest, 1)).ravel()
-    assert alpha.min() > -1e-5
-    assert alpha.max() < 0.4 + 1e-5
-    deciles = np.histogram(alpha, bins=10, range=(0, 0.4))[0]
-    assert abs(deciles - 500).max() < 5 * np.sqrt(500 * 0.9)
-    assert abs(np.corrcoef(alpha[1:], alpha[:-1])[0, 1]) < 5 / np.sqrt(5_000)
 
 
 def test_nu_zero_is_the_optimum_to_the_rounding_of_its_actions():

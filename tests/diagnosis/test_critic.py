@@ -115,6 +115,15 @@ def test_a_critic_that_shaping_misleads_is_told_from_one_that_has_not_learnt():
     assert cube.ranking < 0.8
 
 
+def test_levels_over_time_fall_towards_the_end_of_an_episode_and_continuing_ones_do_not():
+    report = critic(model(TD3), SMESpec(**SMALL), states=1000)
+    first, last = report.times[0], report.times[-1]
+    assert len(report.times) == 10
+    assert last.finite < 0.5 * first.finite
+    assert last.continuing > 0.8 * first.continuing
+    assert critic(model(TD3, gamma=1.0), SMESpec(**SMALL), states=20).times[0].continuing is None
+
+
 @pytest.mark.parametrize(
     ("judged", "arguments", "says"),
     [

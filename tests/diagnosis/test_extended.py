@@ -89,6 +89,15 @@ def test_the_channel_that_violates_is_named_and_costs_add_up():
     assert limits.cut_off.cost == 0.0
 
 
+def test_a_constant_that_violates_costs_as_much_where_it_goes_as_in_uniform_states():
+    # The transition keeps the uniform distribution under a constant action.
+    limits = diagnosis_of(upper_bound_below(np.inf), EXTENDED).measurements.limits
+    uniform = limits.report.regions[0].cost
+    assert limits.visited.cost == pytest.approx(uniform, rel=0.1)
+    assert limits.visited.cost != pytest.approx(uniform, rel=1e-6)  # in other states
+    assert limits.visited.violating_share == pytest.approx(1.0, abs=0.01)
+
+
 def test_an_oracle_that_adds_a_function_of_the_distractors_owes_them_its_regret():
     diagnosis = diagnosis_of(distracted, EXTENDED)
     verdict = diagnosis.verdict("distraction")

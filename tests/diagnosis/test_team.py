@@ -7,7 +7,7 @@ import pytest
 
 from sme_registry import SMESpec, evaluate, load
 from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, load_run
-from sme_registry.diagnosis.measure import POLICY
+from sme_registry.diagnosis.measure import LINEAR, POLICY
 from sme_registry.diagnosis.subject import load_cell
 from sme_registry.diagnosis.task import TEAM_QUESTIONS, TeamDiagnosis
 from sme_registry.errors import UnknownNameError
@@ -144,6 +144,24 @@ def test_an_agent_with_a_harder_optimum_is_distinguished(one_fails):
     assert easy.answer == "no"
     regrets = [each.evidence["linear_normalised_regret"] for each in (easy, verdict)]
     assert regrets[0] < regrets[1]
+
+
+@pytest.mark.parametrize(
+    ("updates", "learnt", "answer"),
+    [(20, 0.79, "yes"), (19, 0.79, "cannot tell"), (None, 0.8, "cannot tell")],
+)
+def test_a_harder_optimum_is_a_cause_only_of_a_team_that_has_learnt(
+    one_fails, updates, learnt, answer
+):
+    *others, driver = one_fails.agents
+    linear = driver.measurements.uniform[LINEAR].model_copy(update={"normalised_regret": 0.9})
+    uniform = {**driver.measurements.uniform, LINEAR: linear}
+    measurements = driver.measurements.model_copy(update={"uniform": uniform})
+    agents = [*others, driver.model_copy(update={"measurements": measurements})]
+    visited = one_fails.visited.model_copy(update={"normalised_regret": learnt})
+    fields = {"agents": agents, "visited": visited, "updates": updates}
+    verdict = one_fails.model_copy(update=fields).judged(TEAM_QUESTIONS).verdict("harder_optimum")
+    assert verdict.answer == answer
 
 
 def test_an_agent_that_fails_only_where_the_team_takes_it():

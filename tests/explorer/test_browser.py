@@ -87,7 +87,6 @@ def choose(page, label, option):
 @pytest.mark.parametrize(
     ("name", "action_range"),
     [
-        ("Complexity50", "symmetric"),
         ("MinReward50", "unit"),
         ("Team2", "unit"),
         ("HardSafeMixed", "symmetric"),

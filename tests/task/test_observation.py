@@ -46,18 +46,6 @@ def test_the_agent_sees_numbers_in_the_unit_cube_which_can_be_undone(task):
     np.testing.assert_allclose(x, np.concatenate([s, d], axis=1), rtol=0, atol=1e-8)
 
 
-@given(observed_tasks())
-def test_state_reward_and_optimum_do_not_depend_on_what_is_seen(task):
-    fields = {**task.spec.to_dict()}
-    del fields["observation"]
-    plain = materialize(SMESpec.from_dict(fields))
-    s, _ = inside(task)
-    a = np.random.default_rng(1).random((40, task.spec.action_dim))
-    np.testing.assert_array_equal(task.optimal_action(s), plain.optimal_action(s))
-    np.testing.assert_array_equal(task.transition(s, a), plain.transition(s, a))
-    np.testing.assert_array_equal(task.step_reward(s, a), plain.step_reward(s, a))
-
-
 def test_without_a_mixing_the_agent_sees_state_and_distractors():
     task = task_of(distractors=3)
     s, d = inside(task)

@@ -97,45 +97,6 @@ def test_each_is_paid_for_its_own_channels_or_all_for_all(spec, seed):
         np.testing.assert_array_equal(done.step_reward[:, agent], expected)
 
 
-def off_by(task, s, *amounts):
-    """Actions that are off the optimum by an amount of each agent's, in each of its channels."""
-    best = task.optimal_action(s)
-    away = np.concatenate([
-        np.full(own.stop - own.start, amount)
-        for own, amount in zip(task.owned, amounts, strict=True)
-    ])  # fmt: skip
-    return np.where(best > 0.5, best - away, best + away)
-
-
-START = np.full((1, 8), 0.3)
-
-
-def one_step(spec, *amounts, t=0, r_cum=(0.0, 0.0, 0.0)):
-    task = materialize(spec)
-    a = off_by(task, START, *amounts)
-    return step(task, START, np.array([t]), np.array([r_cum]), a)
-
-
-def test_r_min_gates_each_agent_by_itself_or_the_mean_over_all_channels():
-    done = one_step(TRIO.derive(r_min=0.5), 0.05, 0.2, 0.1)
-    np.testing.assert_allclose(done.step_reward, [[0.8, 0.0, 0.6]], rtol=0, atol=1e-12)
-    shared = TRIO.derive(team={**TRIO.to_dict()["team"], "reward": "team"}, r_min=0.4)
-    # Mean distance (0.05 + 2 · 0.2 + 3 · 0.1) / 6 = 0.125, so r̂ = 0.5 although one earns 0.2.
-    done = one_step(shared, 0.05, 0.2, 0.1)
-    np.testing.assert_allclose(done.step_reward, 0.5, rtol=0, atol=1e-12)
-
-
-def test_the_end_of_one_is_the_end_of_all():
-    spec = TRIO.derive(D=0.5)
-    assert not one_step(spec, 0.05, 0.1, 0.1).terminated[0]
-    for amounts in ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.2)):
-        assert one_step(spec, *amounts).terminated[0]
-    # A team that is paid as one survives what one of it does, as long as the mean is good.
-    shared = spec.derive(team={**TRIO.to_dict()["team"], "reward": "team"})
-    assert not one_step(shared, 0.2, 0.0, 0.0).terminated[0]
-    assert one_step(shared, 0.2, 0.2, 0.2).terminated[0]
-
-
 def test_names_and_channels_are_in_the_order_of_the_spec():
     task = materialize(TRIO)
     assert task.names == ("agent_0", "agent_1", "agent_2")

@@ -39,14 +39,6 @@ def copy_files(source, target):
             (target / path.name).write_bytes(path.read_bytes())
 
 
-def narrow(env, *, seed, width=8):
-    """An algorithm given as a function."""
-    from stable_baselines3 import PPO
-
-    settings = {"n_steps": 32, "batch_size": 32, "n_epochs": 1}
-    return PPO("MlpPolicy", env, seed=seed, policy_kwargs={"net_arch": [width]}, **settings)
-
-
 class Still:
     """A learner that is no model of Stable-Baselines3."""
 

@@ -81,17 +81,6 @@ def test_the_same_seed_trains_the_same_model_and_another_one_does_not(run, tmp_p
     assert [e.regret for e in other.episodes] != [e.regret for e in run.episodes]
 
 
-def test_a_run_with_limits_and_distractors_is_repeated_and_reports_both(tmp_path):
-    observed = {"distractors": 3, "dynamics": "autonomous", "mixing": "orthogonal"}
-    spec = TINY.derive(safety={"tightness": 0.2}, observation=observed)
-    changes = {"hyperparameters": NARROW, "steps": 110, "protocol": PROTOCOL}
-    one, two = (train(spec, folder=tmp_path / name, **changes) for name in ("one", "two"))
-    assert [e.regret for e in one.episodes] == [e.regret for e in two.episodes]
-    assert one.report.to_dict() == two.report.to_dict()
-    assert one.report.safety is not None
-    assert one.report.observation is not None
-
-
 def test_training_lowers_regret(tmp_path):
     # TD3 on a task of one channel; the first 100 steps act at random.
     spec = SMESpec(state_dim=1, action_dim=1, horizon=25, seed=1)
@@ -191,16 +180,6 @@ def test_hyperparameters_reach_the_model_and_the_record(tmp_path):
     model = sb3_contrib.TQC.load(result.model_path, device="cpu")
     assert (model.learning_rate, model.top_quantiles_to_drop_per_net) == (0.002, 1)
     assert model.policy.net_arch == [16]
-
-
-def test_a_function_that_returns_a_model_of_sb3_is_trained(tmp_path):
-    result = short(
-        tmp_path / "run",
-        algorithm="tests.training.runs:narrow",
-        hyperparameters={"width": 4},
-        steps=64,
-    )
-    assert result.record.steps_done == 64
 
 
 def test_a_learner_of_another_make_is_trained_without_checkpoints(tmp_path):
