@@ -18,6 +18,9 @@ from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.documents import Behaviour
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.io import write_atomically
+from sme_registry.io.markup import fixed
+from sme_registry.profiles.document import Profile
+from sme_registry.profiles.levels import AXES
 from sme_registry.spec import (
     AgentSpec,
     Drift,
@@ -117,6 +120,61 @@ def catalogue() -> str:
             f"| `{protocol.versioned_name}` | {protocol.protocol.states_per_region:,} "
             f"| `{_short(protocol.digest)}` | {protocol.description} |"
         )
+    return "\n".join(lines) + "\n"
+
+
+_PROFILES = """\
+# Reference profiles
+
+What PPO and others do on the default and on two harder levels of nine axes, with 20,000 steps and
+five draws of each level. `sme profile` shows your own algorithm beside them, and
+`sme profile show PPO` one of them. Agents are in JAX, with the default hyperparameters of
+Stable-Baselines3; γ = 0 is their strongest setting where nothing but the present step matters, and
+their weakest on reward intervals and foresight. `linear` is the linear policy nearest to the
+optimum, and does not learn.
+
+![PPO and other references over the levels of nine axes](../../figures/profiles.png)
+
+## N₀ at each level
+
+Normalised regret in the training cube: 0 is the optimum, 1 the constant action ½. IQM over draws.
+The first level of foresight and noise is a task of two layers.
+"""
+_ROBUSTNESS = """
+## Robustness
+
+The mean over the harder levels of 1 − N₀ there, divided by 1 − N₀ at the first level, with its
+95 % interval over draws. A dash: nothing was learnt, or a level was not run.
+"""
+_ORIGIN = """
+## Origin
+
+Made by `docs/results/profiles.py`, from the plan `profile-v1`.
+
+| Profile | `uses` | runs | versions |
+|---|---|---|---|"""
+
+
+def profiles() -> str:
+    """The page of the reference profiles, from the data that the package has."""
+    references = Profile.references()
+    heading = f"| axis | levels | {' | '.join(references)} |"
+    rule = "|---" * (len(references) + 2) + "|"
+    regret, robustness = [heading, rule], [heading, rule]
+    for axis in AXES:
+        place = f"| {axis.label} | {', '.join(axis.levels.values())} | "
+        texts = []
+        for each in references.values():
+            levels = map(each.level, axis.levels)
+            texts.append(", ".join(fixed(x.value) if x.draws else "–" for x in levels))
+        regret.append(f"{place}{' | '.join(texts)} |")
+        kept = [str(each.robustness(axis)) for each in references.values()]
+        robustness.append(f"{place}{' | '.join(kept)} |")
+    lines = [_PROFILES, *regret, _ROBUSTNESS, *robustness, _ORIGIN]
+    for name, each in references.items():
+        versions = ", ".join(f"{package} {v}" for package, v in sorted(each.versions.items()))
+        runs = f"{len(each.rows)} of {each.planned}"
+        lines.append(f"| {name} | `{each.algorithm.uses}` | {runs} | {versions} |")
     return "\n".join(lines) + "\n"
 
 
@@ -228,6 +286,7 @@ def pages() -> dict[str, str]:
     """Every generated page, by its name in `docs/reference/generated/`."""
     cards = {f"catalogue-{group.slug}": page for group, page in gallery().items()}
     others = {"catalogue": catalogue(), "files": documents(), "codes": leaderboard_codes()}
+    others["profiles"] = profiles()
     return {f"{name}.md": text for name, text in (others | cards).items()}
 
 

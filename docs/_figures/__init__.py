@@ -12,5 +12,6 @@ FIGURES: dict[str, Callable[[], Figure | bytes]] = {
     "diagnosis": results.diagnosis,
     "quality": results.quality,
     "ranks": results.ranks,
+    "profiles": results.profiles,
 }
 """By name, which is that of the file in `docs/figures`: figures, or the bytes of a PNG."""

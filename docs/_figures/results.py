@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
@@ -20,11 +21,19 @@ from sme_registry.evaluation import EvaluationReport
 from sme_registry.io import read_json
 from sme_registry.plots import decay_curve, learning_curve
 from sme_registry.plots.style import COLOURS, GREY, MARKERS, legend_below, new_figure, styled
+from sme_registry.profiles.document import Profile
 
 from .method import draw_cube, draw_optimum, plane, spec_of
 
 RESULTS = Path(__file__).parents[1] / "results"
 _STEPS = 12  # of the drawn trajectory
+
+
+def profiles() -> bytes:
+    """The reference profile of PPO, before the others; small, as it has many lines."""
+    content = io.BytesIO()
+    Profile.references()["PPO"].draw().savefig(content, format="png", dpi=110)
+    return content.getvalue()
 
 
 def overview() -> Figure:

@@ -8,7 +8,8 @@ Agents are in JAX. The same command continues from the results in the folder (`-
 runs/profiles, which is not in the repository), also after a kill; programs that run save their
 state every three minutes. After `--minutes`, and after Ctrl-C, what has finished is written, so a
 part is kept by committing `specs/profiles/`. TD3 and SAC with γ = 0 run on the default, the reward
-interval and foresight alone. A profile that the package lacks is shown nowhere.
+interval and foresight alone. A profile that the package lacks is shown nowhere. The pages follow
+with `python docs/generate.py` and `python docs/figures.py profiles`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import signal
 from pathlib import Path
 
 from sme_registry.errors import OptionError
-from sme_registry.profiles.document import AXES, TWO_LAYERS, plan_file
+from sme_registry.profiles.levels import AXES, TWO_LAYERS, plan_file
 from sme_registry.profiles.run import profile_of, slug
 from sme_registry.spec.catalogue import spec_folder
 from sme_registry.studies import run_study

@@ -17,14 +17,15 @@ in pairs: on the same draw of a level with the same seed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
 from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.io.markup import Table, card, conjunction, fixed, signed, table_html
-from sme_registry.spec import StudyAlgorithm, StudyFile, catalogue
+from sme_registry.profiles.levels import AXES, DEFAULT, Axis, plan_file
+from sme_registry.spec import StudyAlgorithm, catalogue
 from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
 from sme_registry.spec.study import PlannedCell
 from sme_registry.statistics import Array, iqm
@@ -34,50 +35,10 @@ from sme_registry.studies.report.findings import THRESHOLDS
 from sme_registry.studies.report.tables import paired
 from sme_registry.studies.result import CellFailure, CellResult
 
-PLAN = "profile"
-DEFAULT, TWO_LAYERS = "default", "complexity-2"
 UNLEARNT = THRESHOLDS["unlearnt"]
 DIGITS = 6
 _HALF = 0.5
 _COMPARED = ("PPO", "TD3", "SAC")  # in sentences; others are in figures and tables
-
-
-class Axis(NamedTuple):
-    """What its levels change, and they by the names of their classes, the base first."""
-
-    label: str
-    levels: Mapping[str, str]
-
-    @property
-    def base(self) -> str:
-        return next(iter(self.levels))
-
-    @property
-    def harder(self) -> list[str]:
-        return [*self.levels][1:]
-
-
-def _axis(label: str, stem: str, values: str, base: str = DEFAULT) -> Axis:
-    first, *harder = values.split()
-    names = {f"{stem}-{value.replace('.', '_')}": value for value in harder}
-    return Axis(label, {base: first, **names})
-
-
-AXES = (
-    _axis("state dimension S", "state_dim", "8 16 64"),
-    _axis("action dimension A", "action_dim", "4 8 16"),
-    _axis("reward interval k", "k", "1 5 25"),
-    _axis("reward threshold r_min", "r_min", "0 0.5 0.75"),
-    _axis("survival threshold D", "D", "0 0.25 0.5"),
-    _axis("complexity L", "complexity", "1 2 10"),
-    _axis("foresight, scale of shaping", "shaping-scale", "0 10 30", TWO_LAYERS),
-    _axis("noise of the reward σ", "noise-reward", "0 0.3 1", TWO_LAYERS),
-    _axis("distractors", "observation-distractors", "0 8 32"),
-)
-
-
-def plan_file() -> StudyFile:
-    return catalogue.find(StudyFile, PLAN)
 
 
 class ProfileRow(StrictModel):
@@ -289,8 +250,7 @@ class Profile(StrictModel):
 
         `others` are the profiles it is compared with, by default `references()`.
         """
-        known = self.comparable(Profile.references().values() if others is None else others)
-        compared = [other for other in known if other.name in _COMPARED]
+        compared = [other for other in self._behind(others) if other.name in _COMPARED]
         return [*self._breaks(), self._speed(), *map(self._comparison, compared)]
 
     def _breaks(self) -> list[str]:
@@ -300,7 +260,11 @@ class Profile(StrictModel):
             return [f"{self.name} learnt too little to lose anything: no robustness is known."]
         least, most = (f(kept, key=lambda label: kept[label].value) for f in (min, max))
         text = f"{self.name} breaks most along {least}: it keeps {kept[least]} of its performance"
-        return [f"{text}. Least of all it is hurt along {most}: {kept[most]}."]
+        text += f". Least of all it is hurt along {most}: {kept[most]}."
+        few = min(kept[least].draws, kept[most].draws) < ENOUGH_RUNS
+        return [
+            f"{text} With fewer than {ENOUGH_RUNS} draws this is an indication." if few else text
+        ]
 
     def _speed(self) -> str:
         default, half = self.level(DEFAULT), self.steps_to_half()
@@ -325,6 +289,15 @@ class Profile(StrictModel):
         if still:
             parts.append(f"open on {still} of {len(contrasts)}")
         return f"Against {other.name}, by the difference of N₀: {'; '.join(parts)}."
+
+    def draw(self, others: Iterable[Profile] | None = None) -> Any:
+        """The figure of all axes, with the references behind, or with `others`."""
+        from sme_registry.profiles.figures import draw_axes
+
+        return draw_axes(self, self._behind(others))
+
+    def _behind(self, others: Iterable[Profile] | None) -> list[Profile]:
+        return self.comparable(Profile.references().values() if others is None else others)
 
     def table(self) -> Table:
         """A row for each axis: its levels, N₀ at each, and the robustness."""

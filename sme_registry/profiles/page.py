@@ -12,41 +12,17 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from markupsafe import Markup
 
 from sme_registry.io import write_atomically
 from sme_registry.io.markup import environment, fixed
-from sme_registry.plots.style import (
-    COLOURS,
-    GREY,
-    MARKERS,
-    draw_band,
-    encoded,
-    literal,
-    new_figure,
-    styled,
-)
-from sme_registry.profiles.document import AXES, Axis, Profile
+from sme_registry.plots.style import encoded
+from sme_registry.profiles.document import Profile
+from sme_registry.profiles.figures import draw_axes, draw_robustness
+from sme_registry.profiles.levels import AXES
 from sme_registry.studies import report
-from sme_registry.studies.report.figures.panels import (
-    LINEAR,
-    WIDTH,
-    Look,
-    legend,
-    new_look,
-    panel_grid,
-    side_by_side,
-)
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-_OTHERS = ("PPO", "TD3", "SAC")  # the order of their colours
-_HIGHEST = 1.45  # N₀ that the figure shows
-_LEAST = -0.6  # robustness
 
 
 class _Table(NamedTuple):
@@ -66,14 +42,10 @@ def write_page(
     """
     known = Profile.references().values() if references is None else references
     others = profile.comparable(known)
-    with styled():
-        figures = {
-            "axes": draw_axes(profile, others),
-            "robustness": draw_robustness(profile, others),
-        }
+    drawn = {"axes": draw_axes(profile, others), "robustness": draw_robustness(profile, others)}
     folder = Path(folder)
-    pdf = encoded(figures["axes"], ["pdf"])["pdf"]
-    svgs = {name: encoded(figure, ["svg"])["svg"] for name, figure in figures.items()}
+    pdf = encoded(drawn["axes"], ["pdf"])["pdf"]
+    svgs = {name: encoded(figure, ["svg"])["svg"] for name, figure in drawn.items()}
     return [
         write_atomically(folder / "profile.html", page(profile, others, svgs)),
         write_atomically(folder / "profile.pdf", pdf),
@@ -92,79 +64,6 @@ def page(profile: Profile, others: Sequence[Profile], figures: Mapping[str, byte
         tables=[_robustness(profile, others), *_differences(profile, others), _levels(profile)],
         origin=[*_origin(profile, others)],
     )
-
-
-def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, dict[str, Any]]:
-    """The profile in front; a method of several discounts has one colour."""
-    looks = {profile.name: dict(new_look(COLOURS[0], MARKERS[0]))}
-    for other in others:
-        method, _, variant = other.name.partition(" (")
-        if method in _OTHERS:
-            i = 1 + _OTHERS.index(method)
-            looks[other.name] = dict(new_look(COLOURS[i], MARKERS[i]))
-            if variant:
-                looks[other.name] |= {"linestyle": (0, (2, 1.5)), "markerfacecolor": "none"}
-        elif other.name == "linear":
-            looks[other.name] = dict(LINEAR)
-    return looks
-
-
-def draw_axes(profile: Profile, others: Sequence[Profile]) -> Figure:
-    """N₀ over the levels of each axis, a panel each."""
-    looks, by_name = _looks(profile, others), {each.name: each for each in (*others, profile)}
-
-    def draw(axes: Axes, axis: Axis) -> None:
-        for name, look in reversed(looks.items()):
-            _draw_line(axes, by_name[name], axis, look, front=name == profile.name)
-        axes.axhline(1.0, color=GREY, linewidth=0.8, linestyle=(0, (1, 2)), zorder=1)
-        axes.set_xticks(range(len(axis.levels)), [*axis.levels.values()])
-        axes.set_xlim(-0.25, len(axis.levels) - 0.75)
-        axes.set_ylim(0.0, _HIGHEST)
-        axes.grid(visible=False, axis="x")
-
-    items = [(axis.label, axis) for axis in AXES]
-    return panel_grid(items, draw, (0.7, 1.75), y="N₀", looks=looks)
-
-
-def _draw_line(axes: Axes, profile: Profile, axis: Axis, look: Look, *, front: bool) -> None:
-    levels = [(i, profile.level(name)) for i, name in enumerate(axis.levels)]
-    at = [(i, level) for i, level in levels if level.draws]
-    if not at:
-        return
-    x, y = [i for i, _ in at], [level.value for _, level in at]
-    banded = [(i, level) for i, level in at if not math.isnan(level.low)]
-    if banded and (front or look["marker"]):
-        bands = ([i for i, _ in banded], [e.low for _, e in banded], [e.high for _, e in banded])
-        draw_band(axes, *bands, look["color"])
-    width, alpha, order = (2.2, 1.0, 3) if front else (1.1, 0.75, 2)
-    axes.plot(x, y, **look, linewidth=width, alpha=alpha, markersize=4, zorder=order)
-
-
-def draw_robustness(profile: Profile, others: Sequence[Profile]) -> Figure:
-    """What is kept of the performance along each axis, a row each."""
-    looks, by_name = _looks(profile, others), {each.name: each for each in (profile, *others)}
-    figure = new_figure((WIDTH, 1.2 + 0.36 * len(AXES)))
-    axes = figure.add_subplot()
-    for name, look, shift in side_by_side(looks, 0.6):
-        for row, axis in enumerate(AXES):
-            kept = by_name[name].robustness(axis)
-            if not kept.draws:
-                continue
-            front = name == profile.name
-            marker = {**look, "marker": look["marker"] or "|", "linestyle": "none"}
-            if not math.isnan(kept.low):
-                width = 1.8 if front else 0.9
-                axes.hlines(row + shift, kept.low, kept.high, color=look["color"], linewidth=width)
-            size = 6.0 if front else 4.0
-            axes.plot([kept.value], [row + shift], **marker, markersize=size, zorder=3)
-    axes.set_yticks(range(len(AXES)), [literal(axis.label) for axis in AXES])
-    axes.set_ylim(len(AXES) - 0.4, -0.6)
-    axes.axvline(1.0, color="black", linewidth=0.9, zorder=1)
-    axes.set_xlim(_LEAST, 1.35)
-    axes.set_xlabel("robustness: share of the performance 1 − N₀ that is kept at the harder levels")
-    axes.grid(visible=False, axis="y")
-    legend(figure, looks)
-    return figure
 
 
 def _robustness(profile: Profile, others: Sequence[Profile]) -> _Table:

@@ -11,14 +11,15 @@ import sme_registry
 from sme_registry import Profile
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation.evaluate import resolve_protocol
-from sme_registry.profiles import document, run
-from sme_registry.profiles.document import AXES, DEFAULT, TWO_LAYERS, ProfileRow
+from sme_registry.profiles import document, levels, run
+from sme_registry.profiles.document import ProfileRow
+from sme_registry.profiles.levels import AXES, DEFAULT, TWO_LAYERS
 from sme_registry.profiles.page import write_page
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.studies import run_study
 from tests import commands
 
-PLAN = document.plan_file()
+PLAN = levels.plan_file()
 RELEASED = {  # levels that the catalogue has as tasks
     "state_dim": "StateDim{}", "action_dim": "ActionDim{}", "k": "Interval{}",
     "r_min": "MinReward{}", "D": "Survival{}", "shaping-scale": "Foresight{}",
