@@ -200,3 +200,20 @@ def test_frames_need_a_mode_a_reset_and_lanes_that_exist():
     for lanes in ([3], [-1], [0.5], 1, "0", []):
         with pytest.raises(OptionError, match="render_lanes"):
             drawn(render_lanes=lanes)
+
+
+def test_what_is_recorded_is_drawn_later_whatever_is_written_into_what_step_returned(monkeypatch):
+    drawn = []
+    draw = rendering.Renderer._draw
+    monkeypatch.setattr(
+        rendering.Renderer, "_draw", lambda self, surface: drawn.append(draw(self, surface))
+    )
+    env, untouched = begun(), begun()
+    action = np.full(4, 0.5, np.float32)
+    info = env.step(action)[4]
+    untouched.step(action.copy())
+    info["optimal_action"][:] = 0.0
+    action[:] = 1.0
+    assert drawn == []
+    np.testing.assert_array_equal(env.render(), untouched.render())
+    assert len(drawn) == 2

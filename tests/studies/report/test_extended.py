@@ -2,6 +2,7 @@
 
 import re
 
+import pandas as pd
 import pytest
 
 from sme_registry.errors import UnknownNameError
@@ -11,7 +12,7 @@ from sme_registry.studies.cell import run_cell
 from sme_registry.studies.report import frames, texts
 from sme_registry.studies.report.design import metrics_of
 from sme_registry.studies.report.frames import study_frames
-from sme_registry.studies.report.tables import analyse
+from sme_registry.studies.report.tables import analyse, layers
 from sme_registry.studies.report.write import compare
 from tests.studies.cells import small_file
 
@@ -153,3 +154,10 @@ def test_tables_for_people_show_them_and_what_the_layers_keep(study, analysis):
     assert plain.parts[0].metrics == tuple(m for m in metrics_of("run") if not m.needs)
     assert "layers" not in texts.csv_tables(plain)
     assert "layers" not in {table.name for table in texts.text_tables(plain)}
+
+
+def test_what_layers_keep_is_the_iqm_over_runs():
+    probes = pd.DataFrame({"run": range(4), "state_r2": [0.2, -100.0, 0.6, 0.4]})
+    kept = layers(probes.assign(class_name="driven", algorithm="PPO", layer=0, distractor_r2=0.25))
+    assert kept.state_r2.tolist() == pytest.approx([0.3])
+    assert kept.runs.tolist() == [4]

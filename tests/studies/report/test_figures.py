@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report import figures
 from sme_registry.studies.report.figures import curves, draw_figures
-from sme_registry.studies.report.figures.panels import FEW, looks_of
+from sme_registry.studies.report.figures.panels import FEW, looks_of, positions, spacing
 from sme_registry.studies.report.tables import analyse
 from tests.geometry import assert_readable
 from tests.studies.report.test_report import FIGURES
@@ -110,3 +110,23 @@ def test_a_method_has_one_colour_in_every_figure_and_a_legend_explains_hollow_ma
     picture = figures.draw((figures.draw_contrasts,), analysis, ())[0][0]
     texts = [text.get_text() for legend in picture.figure.legends for text in legend.get_texts()]
     assert FEW.lower() in texts  # Beta has three pairs on k-25
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([1, 2, 5, 10], "log"),
+        ([0, 0.1, 1], "linear"),
+        ([1, 10], "linear"),
+        (["individual", "team"], "nominal"),
+        ([], "nominal"),
+    ],
+)
+def test_an_axis_has_the_scale_on_which_its_values_are_evenly_spaced(values, expected):
+    assert spacing(values) == expected
+
+
+def test_classes_have_equal_distances_on_their_scale():
+    assert np.allclose(positions([1, 2, 4, 8], 4), np.log([1, 2, 4, 8]))
+    assert list(positions([0.25, 0.5, 0.75], 3)) == [0.25, 0.5, 0.75]
+    assert list(positions(["a", "b"], 2)) == [0.0, 1.0]

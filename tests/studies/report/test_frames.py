@@ -158,3 +158,11 @@ def test_pairs_that_share_an_instance_are_no_independent_draws_of_the_task(loade
     table = studies.compare(StudyFrames(shared, loaded.curves), "Alpha", "Beta")
     assert set(table[table.class_name != ALL].instances) == {1}
     assert "share an instance" in comparison_tables(table)[0].note
+
+
+def test_all_classes_is_the_mean_of_the_classes(loaded):
+    table = studies.compare(loaded, "Alpha", "Beta", ["ood_regret"])
+    classes = table[table.class_name != ALL]
+    total = row(table, ALL, "ood_regret")
+    assert total.difference == pytest.approx(classes.difference.mean())
+    assert total.pairs == classes.pairs.sum() == 23
