@@ -143,7 +143,7 @@ class Verdict(StrictModel):
         if answer == "cannot tell":
             return self.doubt
         own = self._words(str(self.evidence["own_reason"]))
-        return f"{self.doubt} The evidence of this run alone says {answer}: {own}"
+        return f"{self.doubt} Without the comparison, the answer would be {answer}: {own}"
 
     @property
     def doubt(self) -> str:

@@ -1,6 +1,7 @@
 """Every verdict that the rules can give has a sentence, and no sentence lacks a number."""
 
 import random
+import re
 from itertools import chain
 
 import pytest
@@ -118,10 +119,12 @@ def test_every_question_and_reason_is_reached_and_has_a_sentence():
         text = verdict.sentence()
         assert text.endswith(".")
         assert not any(bad in text for bad in ("None", " ,", " .")), text
+        assert not re.search(r"[.)][A-Z]", text), text  # a space is missing
         if verdict.reason in COMPARED.union(DOUBTS):
             own = (verdict.question, verdict.evidence["own_reason"])
             assert own in DECLARED
-            assert ("this run alone" in text) == (verdict.evidence["own_answer"] != "cannot tell")
+            decided = verdict.evidence["own_answer"] != "cannot tell"
+            assert ("Without the comparison" in text) == decided
     assert reached == DECLARED
 
 

@@ -271,8 +271,7 @@ def test_the_evidence_of_the_run_alone_is_kept_in_a_comparison():
     assert verdict.evidence["own_reason"] == "rewards_gated"
     assert verdict.thresholds.items() >= alone.thresholds.items()
     text = verdict.sentence()
-    assert "this run alone says yes" in text
-    assert alone.sentence().partition("says yes: ")[2] in text
+    assert text.endswith(f"Without the comparison, the answer would be yes: {alone.sentence()}")
 
 
 def test_an_inconclusive_comparison_leaves_a_no_and_a_probe_as_they_are():
