@@ -66,8 +66,9 @@ def board_folder(board: str | Path) -> Path:
     path = Path(board)
     if is_url(str(board)):
         raise OptionError(
-            f"{str(board)!r}: must be a board's folder: this command reads its files. Open the URL "
-            "in a browser for the ranking. `submit`, `show` and `withdraw` accept a URL."
+            f"{str(board)!r}: must be a board's folder: this command reads its files. Copy the "
+            f"board with `sme-leaderboard fetch {board} FOLDER`, or open the URL in a browser for "
+            "the ranking. `submit`, `show` and `withdraw` accept a URL."
         )
     if not path.is_dir():
         raise OptionError(

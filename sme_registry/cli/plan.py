@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,7 +40,7 @@ from sme_registry.io.terminal import (
     print_line,
     print_note,
 )
-from sme_registry.spec import StudyFile, StudyPlan, catalogue
+from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan, catalogue
 from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.budget import (
@@ -153,7 +154,9 @@ class PlanOptions(Budgets, ClassOptions):
             "protocol": resolve_protocol(self.protocol).to_dict(),
         }
         plan = StudyPlan.from_dict(fields, source)
-        return self.scaled(StudyFile(name="draft", digest=plan.digest, plan=plan)).plan
+        plan = self.scaled(StudyFile(name="draft", digest=plan.digest, plan=plan)).plan
+        _check_different(plan.algorithms)
+        return plan
 
     def _algorithms(self) -> list[dict[str, Any]]:
         """Each `[NAME=]USES` with each action range."""
@@ -176,6 +179,16 @@ class PlanOptions(Budgets, ClassOptions):
             for name, uses in uses_of
             for action_range in ranges
         ]
+
+
+def _check_different(algorithms: Iterable[StudyAlgorithm]) -> None:
+    for first, second in itertools.combinations(algorithms, 2):
+        if first.model_copy(update={"name": second.name}) == second:
+            raise OptionError(
+                f"--algorithm {second.name}: is {first.name} under another name: all differences "
+                f"would be 0. Change a hyperparameter, such as --set "
+                f"{second.name}.learning_rate=0.001, or leave one of the two out."
+            )
 
 
 def _short_name(uses: str) -> str:

@@ -420,14 +420,19 @@ def _in_paragraphs(text: str) -> str:
 
 
 def _usage_message(error: Any, context: Any) -> str:
-    """Click's message; of an unknown option, the near ones, and --set if the command has it."""
+    """Click's message; of an unknown option, the near ones, or how fields are set instead."""
     unknown = getattr(error, "option_name", "")
     if type(error).__name__ != "NoSuchOption" or context is None:
         return str(error.format_message())
-    known = [name for parameter in context.command.params for name in parameter.opts]
+    known = {name: parameter for parameter in context.command.params for name in parameter.opts}
     near = did_you_mean(unknown, [name for name in known if name.startswith("--")])
     field = unknown.lstrip("-").replace("-", "_")
-    if not near and "--set" in known:
+    if unknown == "--set" and "--shaping" in known:
+        near = (
+            " Each field has an option of its own, such as --complexity 10. That of a block takes "
+            "JSON, such as --shaping '{\"scale\": 3}'."
+        )
+    elif not near and "--set" in known and known["--set"].metavar != "ALGORITHM.NAME=VALUE":
         near = f" Fields and hyperparameters are set by name: --set {field}=VALUE."
     return f"No such option: {unknown}.{near}"
 

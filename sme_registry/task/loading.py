@@ -176,6 +176,7 @@ def _draw(spec: SMESpec) -> Task:
 _draw_cached = functools.lru_cache(maxsize=64)(_draw)
 
 
+_TESTED = "numpy==2.4.6 and scipy==1.17.1"  # as in constraints.txt
 _TOLERANCE = 1e-6
 _DECIMALS = 12
 _GOLDEN = 0.6180339887498949
@@ -212,7 +213,7 @@ def check_fingerprint(published: Fingerprint, task: Task, where: str = "") -> No
                 f"{where}fingerprint.{field}: {difference} (allowed {_TOLERANCE:g}): the task "
                 f"drawn on this machine is not the published one of {task.spec.digest[:19]}…. If "
                 "the file was edited, take it again from its source. If not, this machine's NumPy "
-                "or SciPy draws other numbers: install the versions in constraints.txt."
+                f"or SciPy draws other numbers: install those of the release, {_TESTED}."
             )
 
 

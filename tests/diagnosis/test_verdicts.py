@@ -271,7 +271,8 @@ def test_the_evidence_of_the_run_alone_is_kept_in_a_comparison():
     assert verdict.evidence["own_reason"] == "rewards_gated"
     assert verdict.thresholds.items() >= alone.thresholds.items()
     text = verdict.sentence()
-    assert text.endswith(f"Without the comparison, the answer would be yes: {alone.sentence()}")
+    assert "Without the comparison, the answer would be yes: " in text
+    assert text.endswith(alone.sentence().rpartition(". ")[2])
 
 
 def test_an_inconclusive_comparison_leaves_a_no_and_a_probe_as_they_are():

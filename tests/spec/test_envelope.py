@@ -1,6 +1,8 @@
 """Files: what `save` writes, `load` reads; what was changed on the way is noticed."""
 
 import json
+import re
+from pathlib import Path
 
 import gymnasium
 import pytest
@@ -17,7 +19,13 @@ from sme_registry.errors import (
 from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
 from sme_registry.spec.files import Fingerprint
 from sme_registry.task import load, materialize
-from sme_registry.task.loading import _draw_cached, check_fingerprint, fingerprint_of, load_task
+from sme_registry.task.loading import (
+    _TESTED,
+    _draw_cached,
+    check_fingerprint,
+    fingerprint_of,
+    load_task,
+)
 from tests.strategies import specs
 
 
@@ -123,6 +131,24 @@ def test_other_numbers_than_the_published_neither_load_nor_run(saved):
     ):
         with pytest.raises(FingerprintMismatchError, match=fragment):
             run()
+
+
+def test_a_file_without_a_fingerprint_says_how_to_write_one(saved):
+    data = json.loads(saved.read_text())
+    del data["fingerprint"]
+    saved.write_text(json.dumps(data))
+    with pytest.raises(MalformedDocumentError, match="fingerprint: missing") as error:
+        sme_registry.load(saved)
+    (code,) = re.findall("`(.*)`", str(error.value))
+    eval(code, {"sme_registry": sme_registry, "data": data, "path": saved.parent / "whole.json"})
+    assert sme_registry.load(saved.parent / "whole.json").digest == data["digest"]
+
+
+def test_the_versions_of_the_fingerprints_are_those_of_the_constraints():
+    pinned = (Path(__file__).parents[2] / "constraints.txt").read_text().splitlines()
+    assert [*_TESTED.split(" and ")] == [
+        line for line in pinned if line.startswith(("numpy==", "scipy=="))
+    ]
 
 
 WHOLE = SMESpec(

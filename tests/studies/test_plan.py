@@ -191,6 +191,7 @@ class TestCommands:
             ("new x -t Default -a PPO", "must end in .json"),
             ("new x.json -t Default", "--algorithm"),
             ("new x.json -t Default -a PPO -a PPO", "appears twice"),
+            ("new x.json -t Default -a PPO -a far=PPO", "far: is PPO under another name"),
             ("new x.json -t Default -a PPO --set PPO.n_stepz=64", "Did you mean 'n_steps'"),
             ("new x.json -t Default -a PPO --set n=64", "ALGORITHM.NAME"),
             ("new x.json -t Default -a PPO --sweep k", "NAME=VALUE"),
@@ -204,6 +205,9 @@ class TestCommands:
     def test_bad_input_is_one_line_and_writes_nothing(self, command, words, tmp_path):
         assert words in refused(*command.split())
         assert list(tmp_path.iterdir()) == []
+
+    def test_an_unknown_option_is_not_taken_for_a_hyperparameter_without_an_algorithm(self):
+        assert "VALUE" not in refused("sweep", "-t", "Default", "-a", "PPO", "--log-x")
 
 
 class TestAgents:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from sme_registry.studies.report.analysis import (
     TABLES,
     Analysis,
 )
-from sme_registry.studies.report.design import METRICS, OUTSIDE, WITHIN
+from sme_registry.studies.report.design import ALL, METRICS, OUTSIDE, WITHIN
 from sme_registry.training.algorithms import AGENTS, BACKENDS, parse_uses
 
 _LABELS = {key: metric.label for key, metric in METRICS.items()}
@@ -31,6 +32,7 @@ _HEADINGS = {
 _INTERVAL = "with its 95 % bootstrap interval"
 _MARK = " †"
 _MARKS = f"†: the interval excludes 0, with at least {ENOUGH_RUNS} pairs per class."
+_OF_FEW = f"With fewer than {ENOUGH_RUNS}, a result is an indication."
 _DIFFERENCE = f"{_INTERVAL}. {_MARKS}"
 
 
@@ -43,13 +45,13 @@ class TextTable:
     note: str
     frame: pd.DataFrame
     names: int = 1
+    caption: str = ""  # of LaTeX, after the title
     label: str = ""  # of LaTeX; by default the name
 
     def latex(self) -> str:
         """As a LaTeX `table` that is scaled down to the column's width; ASCII only."""
         columns = [escape_latex(name) for name in self.frame]
-        marked = any(_MARK in str(cell) for cell in self.frame.to_numpy().ravel())
-        caption = f"{self.title}. {_MARKS if marked else ''}".rstrip()
+        caption = f"{self.title}. {self.caption}".rstrip()
         body = self.frame.map(escape_latex).set_axis(columns, axis=1).to_latex(
             index=False, column_format="l" * self.names + "r" * (len(columns) - self.names)
         )  # fmt: skip
@@ -332,8 +334,24 @@ def laid_out(layout: Layout, rows: pd.DataFrame, order: Sequence[str] = ()) -> I
         caveats = difference_caveats(part) if "instances" in part else []
         yield TextTable(
             name, title[0].upper() + title[1:], " ".join([layout.note, *caveats]),
-            frame.fillna(_ABSENT), len(headings),
+            frame.fillna(_ABSENT), len(headings), _caption(layout, part),
         )  # fmt: skip
+
+
+def _caption(layout: Layout, rows: pd.DataFrame) -> str:
+    """What the numbers of a table in a paper are: `IQM over 5 runs, with its 95 % …`."""
+    what = re.match("IQM over ((?:pairs of )?)(runs|lives)", layout.note)
+    if what is None or "low" not in rows:
+        return ""
+    counts = rows["pairs" if what[1] else "runs"][rows.get("class_name", "") != ALL]
+    few, many = int(counts.min()), int(counts.max())
+    n = f"{few}" if few == many else f"{few} to {many}"
+    caption = f"IQM over {n} {what[1]}{what[2]}, with 95 % bootstrap interval"
+    worse = {METRICS[metric].worse for metric in rows.metric}
+    if len(worse) == 1:
+        caption += f"; {'lower' if worse == {1} else 'higher'} is better"
+    marks = f" {_MARKS}" if _MARKS in layout.note else ""
+    return f"{caption}.{marks}" + (f" {_OF_FEW}" if few < ENOUGH_RUNS else "")
 
 
 def _readable(analysis: Analysis) -> dict[str, pd.DataFrame]:
