@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sme_registry import EvaluationReport, evaluate
+from sme_registry import EvaluationReport, SMESpec, evaluate
 from sme_registry.errors import OptionError, SpecError
 from sme_registry.training import train
 from sme_registry.training.record import read_episodes
@@ -116,3 +116,15 @@ def test_other_algorithms_are_rejected(changes, message, tmp_path):
     with pytest.raises(SpecError, match="this is a task of a single agent"):
         train(TINY, independent=True, folder=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_independent_training_lowers_the_regret_of_each_agent(tmp_path):
+    spec = SMESpec.from_dict(
+        {"state_dim": 1, "action_dim": 2, "horizon": 16, "seed": 2,
+         "team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}}
+    )  # fmt: skip
+    settings = {"learning_rate": 0.003, "gamma": 0, "n_steps": 64, "batch_size": 128}
+    result = train(spec, independent=True, steps=2560, num_envs=8, hyperparameters=settings,
+                   folder=tmp_path / "run", protocol=PROTOCOL, progress=False)  # fmt: skip
+    regrets = np.array([episode.agents_regret for episode in result.episodes])
+    assert (regrets[-16:].mean(axis=0) < 0.8 * regrets[:16].mean(axis=0)).all()
