@@ -161,3 +161,12 @@ def test_a_teams_scores_are_the_mean_over_its_agents(reward):
     assert scores.constant.similarity == pytest.approx(each.mean())
     paid_for = task.similarity_of(half, found.optimal_actions) if reward == "team" else each
     assert scores.constant.step_reward == pytest.approx(task.reward_of(paid_for).mean())
+
+
+def test_d3rlpy_gets_copies(fragile):
+    for final_observations in (False, True):
+        given = to_d3rlpy(fragile, final_observations=final_observations)
+        before = fragile.digest
+        for array in given.values():
+            array[:] = -1.0
+        assert fragile.digest == before

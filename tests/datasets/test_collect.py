@@ -225,3 +225,14 @@ def test_replay_compares_the_time_beside_a_mixing_to_the_bit(driven):
     observations[0, -2] = np.nextafter(observations[0, -2], np.float32(1))
     with pytest.raises(FingerprintMismatchError, match="observations, row 0"):
         replay(dataclasses.replace(data, observations=observations), of, task)
+
+
+def test_the_noise_policy_has_the_shapes_of_the_optimal_one_and_other_numbers():
+    for fields in TASKS.values():
+        task = materialize(SMESpec.from_dict(fields))
+        noise = noise_task(task, 0)  # the task's own seed, too, is 0
+        for optimal, other in zip(task.policies, noise.policies, strict=True):
+            for layer, drawn in zip(optimal, other, strict=True):
+                assert layer.W.shape == drawn.W.shape
+                assert np.abs(layer.W - drawn.W).max() > 0.1
+        np.testing.assert_array_equal(task.W, noise.W)

@@ -217,3 +217,16 @@ def test_what_is_recorded_is_drawn_later_whatever_is_written_into_what_step_retu
     assert drawn == []
     np.testing.assert_array_equal(env.render(), untouched.render())
     assert len(drawn) == 2
+
+
+def test_the_numbers_shown_are_those_of_the_episode():
+    env = begun("Default", k=4, horizon=10)
+    earned, paid = 0.0, []
+    for _ in range(10):
+        _, reward, _, _, info = env.step(np.full(4, 0.5, np.float32))
+        earned += info["step_reward"]
+        paid.append(reward)
+        renderer = env._renderer
+        assert renderer._payout == pytest.approx(reward, abs=1e-9)
+        assert renderer._earned - renderer._pending == pytest.approx(sum(paid), abs=1e-9)
+    assert renderer._regrets[-1] == pytest.approx(10 - earned)
