@@ -143,7 +143,7 @@ def _contents(
         contents["index.html"] = page(analysis, rows, figures, absent, tables, explorers)
     for ending in ("png", "pdf"):
         if ending in formats and figures:
-            contents[f"figure.{ending}"] = _main_figure(figures).files[ending]
+            contents[f"figure.{ending}"] = _main_figure(analysis, figures).files[ending]
     numbers, table = _main_table(analysis, tables)
     if "csv" in formats:
         contents["table.csv"] = numbers.to_csv(index=False, lineterminator="\n")
@@ -154,10 +154,13 @@ def _contents(
     return contents | {page.path: page.content for page in explorers}
 
 
-def _main_figure(figures: Sequence[Picture]) -> Picture:
-    """That of the only axis, or the first of the page."""
-    of_axes = [figure for figure in figures if figure.name.startswith("regret-")]
-    return of_axes[0] if len(of_axes) == 1 else figures[0]
+def _main_figure(analysis: Analysis, figures: Sequence[Picture]) -> Picture:
+    """That of the only axis, the difference of two learners, or the first of the page."""
+    preferred = [figure for figure in figures if figure.name.startswith("regret-")]
+    if len(preferred) != 1:
+        two = len(analysis.learners) == 2 and analysis.algorithms[:2] == analysis.learners
+        preferred = [figure for figure in figures if two and figure.name == "differences"]
+    return preferred[0] if preferred else figures[0]
 
 
 def _main_table(analysis: Analysis, tables: Sequence[TextTable]) -> tuple[pd.DataFrame, TextTable]:

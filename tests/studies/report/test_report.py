@@ -108,6 +108,11 @@ def test_within_and_out_of_distribution_are_compared_on_one_range(report):
         assert wd.get_xlim() == ood.get_xlim(), name
 
 
+def test_the_first_figure_of_two_learners_on_several_axes_is_their_difference(written):
+    first = (written / "figure.png").read_bytes()
+    assert first == (written / "figures" / "differences.png").read_bytes()
+
+
 def test_the_command_writes_the_same_files_into_the_study_or_another_folder(
     finished, written, tmp_path
 ):
