@@ -147,6 +147,7 @@ def test_a_command_of_before_says_what_replaces_it(command, instead):
         ("train --suite Default", "is the name of a task, not of a suite. To train on it alone"),
         ("train smoke", "is the name of a suite, not of a task. To train on all of its tasks: sme"),
         ("train Default --lr 0.1", "--set lr=VALUE"),
+        ("new x.json --set shaping.scale=3", "of a block takes JSON, such as --shaping"),
         ("train Default --set lr=0.1", "Did you mean 'learning_rate'"),
         ("train Default --step 5", "Did you mean '--steps'"),
         ("train Default -n 1e5 --seed -1", "seed=-1"),

@@ -291,7 +291,8 @@ def test_what_is_no_board_is_refused_with_advice():
     Path("empty").mkdir()
     before = sorted(Path().rglob("*"))
     for command in ("verify", "score", "site", "serve", "admin reindex", "admin gc", "rank"):
-        assert "Open the URL" in fails(2, *command.split(), "http://127.0.0.1:8000")
+        url = "http://127.0.0.1:8000"
+        assert f"sme-leaderboard fetch {url} FOLDER" in fails(2, *command.split(), url)
     for board, advice in {
         "board/board.json": "Give the folder",
         "tiny-v1.json": "Give the folder",
