@@ -6,12 +6,12 @@ import signal
 import numpy as np
 import pytest
 
-from sme_registry import StreamSpec
+from sme_registry import SMESpec, StreamSpec
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.evaluation import StreamReport, evaluate_stream
 from sme_registry.evaluation.models import load_sb3
 from sme_registry.training import train
-from sme_registry.training.record import RunRecord, read_episodes
+from sme_registry.training.record import RunRecord, VisitEnds, read_episodes
 from tests.training.runs import PROTOCOL, TINY
 
 pytest.importorskip("stable_baselines3")
@@ -210,3 +210,31 @@ def test_what_a_life_cannot_have_is_refused_and_creates_no_folder(change, messag
     with pytest.raises(SMEError, match=message):
         life(tmp_path / "run", **change)
     assert not (tmp_path / "run").exists()
+
+
+SHORT = SMESpec(state_dim=1, action_dim=1, horizon=5)
+VISITS = StreamSpec(
+    phases=[{"spec": SHORT, "steps": 5}, {"spec": SHORT.derive(seed=1), "steps": 5}], cycles=2
+)
+
+
+@pytest.mark.parametrize(
+    ("first", "steps", "called"),
+    [
+        (0, 20, [(0, 6), (1, 11), (2, 16), (3, "end")]),
+        (0, 24, [(0, 6), (1, 11), (2, 16), (3, "end")]),  # the last phase goes on
+        (10, 20, [(1, 11), (2, 16), (3, "end")]),  # resumed before the policy of visit 1 was called
+        (24, 24, [(3, "end")]),  # after the last step
+        (0, 15, [(0, 6), (1, 11), (2, "end")]),  # cut where a visit ends
+        (0, 14, [(0, 6), (1, 11)]),
+    ],
+)
+def test_visits_end_at_the_next_step_and_the_last_one_with_the_training(first, steps, called):
+    ended = []
+    now = first
+    visits = VisitEnds(VISITS, lambda visit: ended.append((visit, now)), first)
+    for now in range(first + 1, steps + 1):
+        visits.after_step(int(now))
+    now = "end"
+    visits.finish(steps)
+    assert ended == called
