@@ -495,3 +495,9 @@ def test_commands_write_the_figures_for_which_the_report_has_numbers(
 def test_bad_input_is_refused(report, draw, message):
     with pytest.raises(OptionError, match=message):
         draw(report)
+
+
+def test_the_window_holds_all_episodes_that_end_at_one_step():
+    step = np.repeat([100, 200, 300], 64)
+    x, _, window = smoothed(step, np.arange(192.0))
+    assert (window, x.tolist()) == (64, [100, 200, 300])

@@ -122,3 +122,11 @@ def test_the_recorded_range_of_a_file_is_used(tmp_path):
     path.write_bytes(model.SerializeToString())
     assert evaluate(path, SPEC, PROTOCOL).action_range == "symmetric"
     assert evaluate(path, SPEC, PROTOCOL, action_range="unit").action_range == "unit"
+
+
+def test_the_policy_that_a_team_shares_is_exported(tmp_path):
+    team = SMESpec(action_dim=2, team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
+    policy = Perceptron([(arrays(12, 1), np.full(1, 0.5), "sigmoid")])
+    path = export_onnx(policy, team, tmp_path / "policy.onnx")
+    exported, own = (evaluate(each, team, PROTOCOL) for each in (path, policy))
+    assert exported.wd_regret == pytest.approx(own.wd_regret, abs=1e-5)
