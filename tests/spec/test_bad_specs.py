@@ -191,7 +191,7 @@ def test_deriving_refuses_as_parsing_does_and_a_source_begins_its_error():
         (EnvFile, SMESpec().to_dict(), "digest: missing: must be the digest of the spec."),
         (
             EnvFile,
-            {"digest": "", "spec": {"team": {"agents": [{"action_dim": 1}]}}},
+            {"digest": "", "spec": {"team": {"agents": [{"action_dim": 1}]}}, "fingerprint": {}},
             "spec.team.agents: their action channels add up to 1",
         ),
         (EnvFile, {"name": "a b"}, "name='a b': must be a string of 1 to 64 letters, digits"),

@@ -3,6 +3,7 @@
 import csv
 import re
 import shutil
+import subprocess
 from html.parser import HTMLParser
 
 import numpy as np
@@ -252,3 +253,19 @@ def test_by_default_a_report_is_a_page_a_figure_and_a_table(finished, tmp_path, 
     names = ["index.html", "figure.png", "table.csv", "table.tex"]
     assert [path.relative_to(tmp_path).as_posix() for path in files] == names
     assert set(pd.read_csv(files[2]).algorithm) == {"Alpha", "Beta", "constant"}
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
+def test_the_table_fits_a_column_of_an_article(finished, tmp_path):
+    (table,) = write_report(finished, tmp_path, ("latex",))
+    (tmp_path / "paper.tex").write_text(
+        "\\documentclass[twocolumn]{article}\\usepackage{booktabs,graphicx}"
+        f"\\begin{{document}}\\input{{{table.name}}}\\end{{document}}\n",
+        encoding="ascii",
+    )
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
+    log = (tmp_path / "paper.log").read_text(encoding="latin-1")
+    assert done.returncode == 0, log
+    assert "Overfull" not in log
+    assert "too large" not in log
