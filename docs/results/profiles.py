@@ -1,4 +1,4 @@
-"""The reference profiles of the package, `specs/profiles/*.json`, from the plan `profile-v1`.
+"""The reference profiles of the package, from the plan `profile-v1`.
 
     python docs/results/profiles.py PPO "PPO (gamma 0)" linear constant       # minutes
     python docs/results/profiles.py TD3 SAC --minutes 90                      # hours, in parts
@@ -7,9 +7,9 @@
 Agents are in JAX. The same command continues from the results in the folder (`--folder`, by default
 runs/profiles, which is not in the repository), also after a kill; programs that run save their
 state every three minutes. After `--minutes`, and after Ctrl-C, what has finished is written, so a
-part is kept by committing `specs/profiles/`. TD3 and SAC with γ = 0 run on the default, the reward
-interval and foresight alone. A profile that the package lacks is shown nowhere. The pages follow
-with `python docs/generate.py` and `python docs/figures.py profiles`.
+part is kept by committing `sme_registry/profiles/references/`. TD3 and SAC with γ = 0 run on the
+default, the reward interval and foresight alone. A profile that the package lacks is shown nowhere.
+The pages follow with `python docs/generate.py` and `python docs/figures.py profiles`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import signal
 from pathlib import Path
 
 from sme_registry.errors import OptionError
+from sme_registry.profiles.document import REFERENCES
 from sme_registry.profiles.levels import AXES, TWO_LAYERS, plan_file
 from sme_registry.profiles.run import profile_of, slug
-from sme_registry.spec.catalogue import spec_folder
 from sme_registry.studies import run_study
 
 SHORT = ("TD3 (gamma 0)", "SAC (gamma 0)")
@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--folder", default="runs/profiles", help="of the study")
     parser.add_argument("--minutes", type=int, default=0, help="stop after so many")
     parser.add_argument("--jobs", type=int, help="programs at once; default one per core")
-    parser.add_argument("--out", type=Path, default=spec_folder() / "profiles")
+    parser.add_argument("--out", type=Path, default=REFERENCES)
     options = parser.parse_args()
     if options.minutes:
         signal.signal(signal.SIGALRM, signal.default_int_handler)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -25,7 +26,7 @@ import numpy as np
 from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.io.markup import Table, card, conjunction, fixed, signed, table_html
 from sme_registry.profiles.levels import AXES, DEFAULT, Axis, plan_file
-from sme_registry.spec import StudyAlgorithm, catalogue
+from sme_registry.spec import StudyAlgorithm
 from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
 from sme_registry.spec.study import PlannedCell
 from sme_registry.statistics import Array, iqm
@@ -35,6 +36,7 @@ from sme_registry.studies.report.findings import THRESHOLDS
 from sme_registry.studies.report.tables import paired
 from sme_registry.studies.result import CellFailure, CellResult
 
+REFERENCES = Path(__file__).parent / "references"
 UNLEARNT = THRESHOLDS["unlearnt"]
 DIGITS = 6
 _HALF = 0.5
@@ -157,8 +159,7 @@ class Profile(StrictModel):
     @classmethod
     def references(cls) -> dict[str, Self]:
         """The profiles that the package has, by name: PPO first."""
-        paths = (catalogue.spec_folder() / "profiles").glob("*.json")
-        known = {profile.name: profile for profile in map(cls.read, paths)}
+        known = {profile.name: profile for profile in map(cls.read, REFERENCES.glob("*.json"))}
         order = [algorithm.name for algorithm in plan_file().plan.algorithms]
         return {name: known[name] for name in sorted(known, key=order.index)}
 
