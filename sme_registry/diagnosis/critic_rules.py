@@ -60,6 +60,7 @@ def _critic_outside(run: TaskDiagnosis) -> Decision:
 @_about(
     yes="misled_by_discount",
     no="not_misled nothing_misleads",
+    unclear="neither_learnt",
     thresholds="ranks_well ranks_badly",
 )
 def _discount(run: TaskDiagnosis) -> Decision:
@@ -72,7 +73,9 @@ def _discount(run: TaskDiagnosis) -> Decision:
         "misled_ranking": cube.misled_ranking,
         "gamma": report.gamma,
     }
-    return Decision(_well(cube.misled_ranking) and _badly(cube.ranking), evidence)
+    if _badly(cube.ranking) and not _well(cube.misled_ranking):
+        return Decision("neither_learnt", evidence)
+    return Decision(_badly(cube.ranking), evidence)
 
 
 def _well(ranking: float) -> bool:
