@@ -552,6 +552,7 @@ class TestEvaluate:
         good("evaluate", "random", "Plane1", *QUICK, "--out", "ev", "--force")
         assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "random"
 
+    @pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
     def test_a_function_of_ones_own_is_evaluated_in_the_range_it_says(self, tmp_path):
         (tmp_path / "mine_for_the_test.py").write_text(
             "import numpy as np\n"

@@ -51,6 +51,7 @@ def test_beyond_the_table_it_is_zero_or_one_and_a_half_for_tiny_arguments():
 SPEC = SMESpec(k=3, r_min=0.1, complexity=3)
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_the_plain_environment_is_ours_step_for_step():
     plain, ours = PlainEnv(materialize(SPEC)), sme_registry.make(SPEC).unwrapped
     random = np.random.default_rng(0)
@@ -67,6 +68,7 @@ def test_the_plain_environment_is_ours_step_for_step():
             np.testing.assert_allclose(value, mine[4][key], atol=1e-12, rtol=0)
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_the_plain_batch_is_ours_step_for_step():
     plain = PlainBatch(materialize(SPEC), 70)
     ours = sme_registry.make_vec(SPEC, 70)

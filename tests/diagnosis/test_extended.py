@@ -138,6 +138,7 @@ def offset(observation):
     ],
     ids=["constant", "offset", "noisy"],
 )
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_what_is_not_owed_to_distractors(policy, reasons, low, high):
     verdict = verdict_of(policy, "distraction")
     assert verdict.answer == "no"

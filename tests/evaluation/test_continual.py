@@ -51,6 +51,7 @@ def report(seed=0):
 # Retention
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_the_matrix_has_the_normalised_regret_of_an_evaluation_on_each_phases_task():
     for j, phase in enumerate(THREE.phases):
         for v in range(3):

@@ -45,6 +45,7 @@ def test_a_constant_action_costs_its_regret_in_uniform_states():
     ],
     ids=["drift", "observes_phase", "early termination", "switch within an episode"],
 )
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_expected_regret_is_the_mean_regret_of_lives(stream):
     visits = stream.cycles * len(stream.phases)
     policies = [network(v, stream.observation_dim) for v in range(visits)]

@@ -178,6 +178,7 @@ def module(forward, *layers):
     return Module()
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_torch_modules_have_the_probes_of_their_layers():
     torch = pytest.importorskip("torch")
     Linear = torch.nn.Linear
@@ -204,6 +205,7 @@ def test_torch_modules_have_the_probes_of_their_layers():
 @pytest.mark.parametrize(
     ("name", "widths"), [("PPO", [64, 64]), ("SAC", [256, 256]), ("TD3", [400, 300])]
 )
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_models_have_the_probes_of_their_layers(name, widths):
     sb3 = pytest.importorskip("stable_baselines3")
     action_range = "unit" if name == "PPO" else "symmetric"
@@ -214,6 +216,7 @@ def test_models_have_the_probes_of_their_layers(name, widths):
     assert all(-0.1 < probe.state_r2 <= 1.0 for probe in probes)
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_torch_modules_whose_linear_layers_form_no_chain_have_no_probes():
     torch = pytest.importorskip("torch")
     nn, entries = torch.nn, SPEC.observation_dim

@@ -69,6 +69,7 @@ def test_a_policy_is_given_float32_observations_that_it_may_overwrite():
     assert seen == [(np.float32, (200, 5))] * 3
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_actions_are_clipped_and_the_clipped_share_is_counted():
     report = evaluated(constant(-0.2, 1.0))
     assert [region.clipped_share for region in report.regions] == [0.5] * 3
@@ -273,6 +274,7 @@ def test_a_model_that_predicts_in_its_own_way_is_asked_for_its_predictions(sb3):
 
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
 @pytest.mark.parametrize("algorithm", ["PPO", "TD3"])
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_a_model_scores_as_its_deterministic_predictions(sb3, algorithm, action_range):
     model = untrained(sb3, algorithm, action_range)
     own = evaluated(model)
@@ -287,6 +289,7 @@ def test_a_model_scores_as_its_deterministic_predictions(sb3, algorithm, action_
         assert 0.05 < own.regions[0].clipped_share < 0.95
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_evaluating_a_model_leaves_its_training_mode_alone(ppo):
     for mode in (True, False):
         ppo.policy.set_training_mode(mode)
@@ -335,6 +338,7 @@ def network(onnx, path, o=5, a=2, dtype="FLOAT", batch="batch", operator="MatMul
 
 
 @pytest.mark.parametrize("action_range", [None, "unit", "symmetric"])
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_an_onnx_file_scores_as_its_network_in_numpy(onnx, tmp_path, action_range):
     W = network(onnx, tmp_path / "actor.onnx")
     report = evaluated(tmp_path / "actor.onnx", action_range=action_range)
@@ -395,6 +399,7 @@ FORMS = ["linear", "agent.zip", "agent.onnx", "agent.npz", "own:act", "module:ac
 
 
 @pytest.mark.parametrize("form", FORMS)
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_python_evaluates_everything_that_the_command_line_does(form, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     if form == "agent.zip":

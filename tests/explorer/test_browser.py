@@ -210,6 +210,7 @@ def test_a_task_of_one_channel_has_a_map_over_time(tmp_path, opened):
     assert (shown["axes"], shown["low"]) == ([0, 1], [-0.5, 0])
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_no_page_is_wider_than_the_screen(tmp_path, opened):
     spec = load("HardSafeMixed", SMESpec)
     policy = perceptron(spec)

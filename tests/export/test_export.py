@@ -52,6 +52,7 @@ def test_arrays_are_exported_without_pytorch(hidden, action_range, tmp_path, mon
     assert {prop.key: prop.value for prop in model.metadata_props} == {"action_range": "unit"}
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_a_policy_that_sees_distractors_is_exported(tmp_path):
     observed = {"distractors": 4, "mixing": "orthogonal"}
     spec = SPEC.derive(safety={"tightness": 0.2}, observation=observed)

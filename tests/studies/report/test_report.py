@@ -255,8 +255,9 @@ def test_by_default_a_report_is_a_page_a_figure_and_a_table(finished, tmp_path, 
     assert set(pd.read_csv(files[2]).algorithm) == {"Alpha", "Beta", "constant"}
 
 
-@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
 def test_the_table_fits_a_column_of_an_article(finished, tmp_path):
+    if not (shutil.which("pdflatex") and subprocess.call(["kpsewhich", "booktabs.sty"]) == 0):
+        pytest.skip("needs pdflatex with booktabs")
     (table,) = write_report(finished, tmp_path, ("latex",))
     (tmp_path / "paper.tex").write_text(
         "\\documentclass[twocolumn]{article}\\usepackage{booktabs,graphicx}"
