@@ -81,7 +81,7 @@ class ProfileFailure(StrictModel):
     error: str
 
 
-class Estimate(NamedTuple):
+class DrawEstimate(NamedTuple):
     """A number over draws with its 95 % interval; NaN where it is unknown."""
 
     value: float = math.nan
@@ -102,7 +102,7 @@ class Estimate(NamedTuple):
 class Contrast(NamedTuple):
     """The difference of N₀ of two algorithms over pairs of runs, and the verdict on the first."""
 
-    difference: Estimate
+    difference: DrawEstimate
     verdict: str
 
     def __str__(self) -> str:
@@ -189,13 +189,13 @@ class Profile(StrictModel):
         numbers = {row.run: getattr(row, field) for row in rows}
         return {run: value for run, value in numbers.items() if value is not None}
 
-    def level(self, class_name: str, field: str = "wd_regret") -> Estimate:
+    def level(self, class_name: str, field: str = "wd_regret") -> DrawEstimate:
         """The IQM over the draws of a level."""
         values = self.values(class_name, field)
         runs = np.array([[value] for value in values.values()])
         return self._estimate(runs, iqm, "level", class_name, field)
 
-    def robustness(self, axis: Axis) -> Estimate:
+    def robustness(self, axis: Axis) -> DrawEstimate:
         """What is kept of the performance at the harder levels, over draws that have all levels."""
         levels = [self.values(name) for name in (axis.base, *axis.harder) if self.values(name)]
         complete = set[int].intersection(*map(set, levels)) if len(levels) > 1 else set()
@@ -208,12 +208,14 @@ class Profile(StrictModel):
     def _asked(self, axis: Axis) -> list[str]:
         return [name for name in axis.levels if name in self.classes]
 
-    def _estimate(self, runs: Array, statistic: Callable[[Any], Array], *place: str) -> Estimate:
+    def _estimate(
+        self, runs: Array, statistic: Callable[[Any], Array], *place: str
+    ) -> DrawEstimate:
         if not len(runs):
-            return Estimate()
+            return DrawEstimate()
         bootstrap = Bootstrap(self.plan_digest)
         ends = bootstrap.interval({"": runs}, "profile", *place, statistic=statistic)
-        return Estimate(float(statistic(runs)[0]), *ends, len(runs))
+        return DrawEstimate(float(statistic(runs)[0]), *ends, len(runs))
 
     def steps_to_half(self, class_name: str = DEFAULT) -> float | None:
         """The median over draws; infinite where it was not reached, None if it is unknown."""
@@ -233,7 +235,7 @@ class Profile(StrictModel):
         *_, value, low, high, count, _, verdict = paired(
             pairs, METRICS["wd_regret"], Bootstrap(self.plan_digest), *place
         )
-        return Contrast(Estimate(value, low, high, count), verdict)
+        return Contrast(DrawEstimate(value, low, high, count), verdict)
 
     def _pairs(self, other: Profile, name: str) -> Array:
         ours, theirs = self.values(name), other.values(name)
