@@ -3,8 +3,8 @@
     python docs/results/foresight.py                     # tables and figures, of the rows beside it
     python docs/results/foresight.py --run PPO runs/ppo  # first the runs of an algorithm; resumable
 
-A run trains in JAX and is measured in the cube, in the shells, and at its critic. Runs take about
-five minutes of processor time with PPO, and an hour and a half each with TD3 and SAC.
+A run trains in JAX and is measured in the cube, in the shells, and at its critic. The runs of PPO
+take minutes, those of TD3 and SAC an hour or more each.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def critics(algorithm: str, gamma: float, place: Path, cells: dict[str, Any]) ->
 
 
 def append(rows: pd.DataFrame, path: Path, key: list[str]) -> None:
-    """Write rows into a file, in the place of those with the same key."""
+    """Write rows into a file, in place of those with the same key."""
     if path.exists():
         old = pd.read_csv(path)
         new = set(map(tuple, rows[key].to_numpy().tolist()))
