@@ -51,7 +51,7 @@ from sme_registry.studies.runner import run_study
 from sme_registry.task import load
 from sme_registry.training import algorithms
 from sme_registry.training.record import CHECKPOINT
-from sme_registry.training.run import DEFAULT_STEPS
+from sme_registry.training.run import DEFAULT_STEPS, default_protocol
 
 RUNS = 10
 """Runs on each class by default: those that a leaderboard requires for a rank."""
@@ -250,9 +250,10 @@ def _train_task(options: Settings, task: str) -> None:
     )
     if result.record.stream is None:
         _write_explorer(folder)
-    if options.protocol is None and result.record.steps < DEFAULT_STEPS:
+    chosen = default_protocol(result.record.steps)
+    if options.protocol is None and chosen != "paper-v1":
         print_note(
-            f"Evaluated with quick-v1, since the training has fewer than {DEFAULT_STEPS:,} steps. "
+            f"Evaluated with {chosen}, since the training has fewer than {DEFAULT_STEPS:,} steps. "
             "Use --protocol paper-v1 for the full evaluation."
         )
     print_training(result, folder, json=options.json)
