@@ -121,6 +121,18 @@ def advance(
     return observe(after, params), after, reward, terminated | truncated, info
 
 
+@jax.jit
+@jax.vmap
+def shaping_at_switch(state: EnvState, before: TaskParams, after: TaskParams) -> jax.Array:
+    """What the last reward of each run gains where its tasks switch within an episode, `[runs]`.
+
+    See `sme_registry.task.task.shaping_at_switch`; an episode that has just begun gains nothing.
+    """
+    g = 1.0 if before.shaping is None else before.shaping.discount
+    change = task.potential(after, state.s, state.t) - task.potential(before, state.s, state.t)
+    return jnp.where(state.t > 0, g * change, 0.0)
+
+
 def moved(
     state: EnvState, action: jax.Array, numbers: StepDraws | None, params: TaskParams
 ) -> EnvState:

@@ -163,8 +163,7 @@ class OffPolicyProgram(Program):
         while self.steps < end or not logs:
             size = min(PIECE, max(0, self.lives.until(self.steps, end) - self.steps))
             log = self._loop(self.steps, self.steps + size, acts=True)
-            self._go_on(size)
-            logs.append(log.rows(slice(size)))
+            logs.append(self._go_on(log.rows(slice(size))))
         return StepLog.joined(logs)
 
     def finish(self) -> None:
@@ -176,13 +175,16 @@ class OffPolicyProgram(Program):
         name = f".{self.buffer}"
         return arrays | {name: arrays[name][: self.steps]}
 
-    def _go_on(self, steps: int) -> None:
-        """Count steps; where they end on other tasks, observe them."""
+    def _go_on(self, log: StepLog) -> StepLog:
+        """Count steps; where they end on other tasks, observe these and pay their shaping."""
         before = self.params
-        self.steps += steps
-        if self.params is not before:
-            phase = self.lives.phase_after(self.steps)
-            self.state = _switched(self.state, self.params, phase, self.steps - 1)
+        self.steps += len(log.reward)
+        if self.params is before:
+            return log
+        phase = self.lives.phase_after(self.steps)
+        change = self.lives.paid_at_switch(self.steps, self.state.episode)
+        self.state = _switched(self.state, self.params, phase, self.steps - 1, change)
+        return log if change is None else log.paid(change)
 
     def _loop(self, begin: int, end: int, acts: bool) -> StepLog:
         log: StepLog
@@ -249,12 +251,18 @@ def _steps(
 
 @functools.partial(jax.jit, donate_argnames=("state",))
 def _switched(
-    state: OffPolicyState, params: TaskParams, phase: jax.Array, row: jax.Array
+    state: OffPolicyState,
+    params: TaskParams,
+    phase: jax.Array,
+    row: jax.Array,
+    change: jax.Array | None,
 ) -> OffPolicyState:
-    """The state after a switch to other tasks, which also changes s' of the last row."""
+    """The state after a switch to other tasks, which changes s' and R of the last row."""
     observation = jax.vmap(observe)(state.episode, params)
     begins = state.episode.t == 0
     buffer = rewrite_next(state.buffer, row, observation, begins, phase)
+    if change is not None:
+        buffer = buffer.at[row % len(buffer), :, -2].add(change.astype(jnp.float32))
     return state._replace(observation=observation, buffer=buffer)
 
 

@@ -376,7 +376,14 @@ class PPOProgram(Program):
                 part.start,
                 part.stop,
             )
-            logs.append(log.rows(part))
+            log = log.rows(part)
+            change = self.lives.paid_at_switch(self.steps, self.state.episode)
+            if change is not None:
+                steps = self.state.steps
+                reward = steps.reward.at[:, part.stop - 1].add(change.astype(np.float32))
+                self.state = self.state._replace(steps=steps._replace(reward=reward))
+                log = log.paid(change)
+            logs.append(log)
         return logs
 
     def finish(self) -> None:

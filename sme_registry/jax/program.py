@@ -23,7 +23,16 @@ import numpy.typing as npt
 
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.jax import find_device
-from sme_registry.jax.env import EnvState, Info, advance, moved, observe, start, to_unit
+from sme_registry.jax.env import (
+    EnvState,
+    Info,
+    advance,
+    moved,
+    observe,
+    shaping_at_switch,
+    start,
+    to_unit,
+)
 from sme_registry.jax.networks import HostWeights, Weights
 from sme_registry.jax.task import (
     Form,
@@ -75,6 +84,12 @@ class StepLog(NamedTuple):
         log: StepLog = jax.tree.map(lambda column: np.asarray(column)[part], self)
         return log
 
+    def paid(self, change: Any) -> StepLog:
+        """The same steps, where the last reward of each run changes by `[runs]`."""
+        reward = np.array(self.reward)
+        reward[-1] += change
+        return self._replace(reward=reward)
+
 
 class Evaluation(NamedTuple):
     """Episodes of the present deterministic policies: sums over steps, `[runs, episodes]`."""
@@ -102,6 +117,7 @@ class Lives:
         segments = [*zip(*(drawn[document] for document in documents), strict=True)]
         specs = [task.spec for tasks in segments for task in tasks]
         self.separable = all(spec.separable for spec in specs)
+        self._shaped = any(spec.shaping is not None for spec in specs)
         params = {
             tasks: jax.device_put(stacked_params(tasks), device)
             for tasks in dict.fromkeys(segments)
@@ -119,6 +135,13 @@ class Lives:
 
     def until(self, lifetime: int, limit: int) -> int:
         return min(limit, self._times.next_switch(lifetime))
+
+    def paid_at_switch(self, lifetime: int, episode: EnvState) -> Array | None:
+        """What a switch after so many steps adds to the last reward, `[runs]`; None for nothing."""
+        before, after = self.at(lifetime - 1), self.at(lifetime)
+        if before is after or not self._shaped:
+            return None
+        return np.asarray(shaping_at_switch(episode, before, after))
 
     def phase_after(self, lifetime: int) -> jax.Array:
         """The one-hot `[runs, P]` in the last observation of an episode that ends there."""

@@ -223,10 +223,12 @@ def next_state(
 
 
 def potential(params: TaskParams, s: jax.Array, t: jax.Array) -> jax.Array:
-    """P_t(s) of a state `[S]` after t steps, in a task with `shaping`."""
-    shaping: Any = params.shaping
+    """P_t(s) of a state `[S]` after t steps; 0 in a task without `shaping`."""
+    shaping = params.shaping
+    if shaping is None:
+        return jnp.zeros(())
     left = 1.0 - t.astype(jnp.float64) / params.horizon.astype(jnp.float64)
-    return cast("jax.Array", shaping.scale * left * _uniform(shaping.layer, s)[0])
+    return shaping.scale * left * _uniform(shaping.layer, s)[0]
 
 
 def transition(
@@ -449,12 +451,6 @@ def _check_fields(spec: SMESpec) -> None:
 
 def _check_switches(stream: StreamSpec) -> None:
     """Raise SpecError unless every episode ends where a phase is left, or phases switch at once."""
-    shaped = any(spec.shaping is not None for spec in stream.specs)
-    if shaped and stream.switch == "step":
-        raise SpecError(
-            'switch="step": must be "episode", since agents in JAX leave a phase with shaping '
-            "where an episode ends. Use an algorithm of Stable-Baselines3, or change switch."
-        )
     if stream.switch == "step" or len(stream.segments) * stream.cycles == 1:
         return
     otherwise = 'Use an algorithm of Stable-Baselines3, such as PPO, or choose switch="step".'

@@ -23,6 +23,7 @@ from sme_registry.jax.td3_sac import TD3, TD3Program
 from sme_registry.spec import StreamSpec
 from sme_registry.task import observe, step
 from sme_registry.task.loading import materialize_segments
+from sme_registry.task.task import shaping_at_switch
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
@@ -44,9 +45,11 @@ def stream_of(*phases, drift=None, **fields):
 
 
 # Switches where an episode is truncated (13), and within one and from k = 20 to k = 1 (25); within
-# rollouts, and at the end of the first one (32).
+# rollouts, and at the end of the first one (32); with shaping, with none, and with another one.
 SUDDEN = stream_of(
-    (OTHERS[1], 13), (BASE.derive(D=0.0, k=20), 12), (OTHERS[0], 7), drift=DRIFT,
+    (OTHERS[1].derive(shaping={"scale": 3.0, "discount": 0.9}), 13),
+    (BASE.derive(D=0.0, k=20), 12),
+    (OTHERS[0].derive(shaping={"scale": 2.0}), 7), drift=DRIFT,
     cycles=2, switch="step", observes_phase=True,
 )  # fmt: skip
 CURRICULUM = stream_of(
@@ -123,8 +126,11 @@ def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(algorithm
             t, waiting = t + 1, one.accumulated_reward
             ends = one.terminated[0], one.truncated[0]
             assert ends == (life.log.terminated[n, run], life.log.truncated[n, run])
+            reward = one.reward[0, 0]
+            if at_once and not any(ends):
+                reward += shaping_at_switch(task, tasks[following], one.state[0], int(t[0]))
             rewards = life.log.reward[n, run], life.reward[n, run]
-            assert rewards == pytest.approx([one.reward[0, 0]] * 2, abs=1e-5)
+            assert rewards == pytest.approx([reward] * 2, abs=1e-5)
             regret = life.log.regret[n, run], 1 - life.log.similarity[n, run]
             expected = 1 - one.step_reward[0, 0], 1 - one.similarity[0, 0]
             assert regret == pytest.approx(expected, abs=1e-5)
