@@ -29,7 +29,6 @@ from sme_registry.cli.arguments import (
     with_options,
 )
 from sme_registry.diagnosis.figures import draw
-from sme_registry.diagnosis.subject import load_cell
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport
 from sme_registry.evaluation.evaluate import acts_below_range
@@ -47,6 +46,7 @@ from sme_registry.spec import (
     StreamSpec,
     catalogue,
 )
+from sme_registry.studies.subject import find_result, load_cell
 from sme_registry.task import load
 
 _EVALUATION = "evaluation.json"
@@ -395,11 +395,15 @@ def _write_page(
     pairs = [_channels(text) for text in channels or ()]
     target = _target(what, options, out, force=force)
     subject = options.subject(what, or_task=True)
-    is_run = not isinstance(subject, SMESpec) and options.task is None
+    report = None
+    if options.cell is not None:
+        report = find_result(what, options.cell).report
+    elif options.task is None and not isinstance(subject, SMESpec):
+        report = explorer.run_report(what)
     written = explorer.write_explorer(
         target,
         subject,
-        report=explorer.run_report(what, options.cell) if is_run else None,
+        report=report,
         channels=pairs,
         episodes=episodes,
         seed=seed,

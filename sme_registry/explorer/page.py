@@ -25,7 +25,7 @@ from markupsafe import Markup
 
 from sme_registry.diagnosis.behaviour import Log, rollout
 from sme_registry.diagnosis.measure import MAX_NUMBERS, fit_references
-from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject, cell_path, read_cell
+from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.evaluation import EvaluationReport, Policy
 from sme_registry.evaluation.policies import TeamPolicy
@@ -102,11 +102,8 @@ def explorer_page(data: dict[str, Any], static: str = "") -> str:
     )
 
 
-def run_report(folder: str | os.PathLike[str], cell: str | None = None) -> EvaluationReport | None:
-    """The evaluation of a run's folder, or of a finished cell of a study; None if there is none."""
-    if cell is not None:
-        report = read_cell(cell_path(Path(folder), cell)).report
-        return report if isinstance(report, EvaluationReport) else None
+def run_report(folder: str | os.PathLike[str]) -> EvaluationReport | None:
+    """The evaluation in a run's folder; None if there is none."""
     path = Path(folder) / EVALUATION
     return EvaluationReport.read(path) if path.exists() else None
 

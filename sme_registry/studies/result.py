@@ -165,6 +165,13 @@ class CellResult(StrictModel):
         return self.any_report._repr_html_()
 
 
+def with_fresh(report: StreamReport, fresh: Sequence[CellResult]) -> StreamReport:
+    """The report of a life with its fresh agents, one for each phase."""
+    costs = [result.online_regret for result in fresh if result.online_regret is not None]
+    known = len(costs) == len(fresh) and report.dynamic_regret is not None
+    return report.with_fresh([result.any_report for result in fresh], costs if known else None)
+
+
 class CellFailure(StrictModel):
     """A run that raised an error: its message and the last lines of its traceback."""
 

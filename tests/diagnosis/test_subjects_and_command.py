@@ -9,8 +9,8 @@ import pytest
 
 import sme_registry
 from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_run
-from sme_registry.diagnosis.subject import load_cell
 from sme_registry.errors import DigestMismatchError, OptionError, PolicyError, UnknownNameError
+from sme_registry.studies.subject import load_cell
 from sme_registry.wrappers import RecordRegret
 from tests.commands import good, refused
 from tests.diagnosis.policies import SPEC, diagnosis_of, faults, shrunk
@@ -157,7 +157,7 @@ def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path):
     (tmp_path / "models" / f"{keys[2]}.zip").unlink()
     assert "--keep-models" in refused("diagnose", tmp_path, "--cell", keys[2])
     (tmp_path / "cells" / f"{keys[1]}.json").write_text("{}")
-    assert "not the result of a cell" in refused("diagnose", tmp_path, "--cell", keys[1])
+    assert "missing" in refused("diagnose", tmp_path, "--cell", keys[1])
 
 
 def test_without_matplotlib_there_is_a_page_without_figures(tmp_path, monkeypatch):

@@ -8,12 +8,12 @@ import pytest
 from sme_registry import SMESpec, evaluate, load
 from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, load_run
 from sme_registry.diagnosis.measure import LINEAR, POLICY
-from sme_registry.diagnosis.subject import load_cell
 from sme_registry.diagnosis.task import TEAM_QUESTIONS, TeamDiagnosis
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies import run_study
+from sme_registry.studies.subject import load_cell
 from tests.commands import good
 from tests.diagnosis.policies import markdown, printed
 from tests.geometry import assert_readable

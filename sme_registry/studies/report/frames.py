@@ -105,7 +105,7 @@ from sme_registry.spec.cards import BLOCKS, fields_of_block, number_type
 from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.design import metrics_of
-from sme_registry.studies.result import CellResult
+from sme_registry.studies.result import CellResult, with_fresh
 
 RUN = ["class_name", "algorithm", "run"]
 RUN_COLUMNS = "class_name:str algorithm:str run:int64 "  # columns of `RUN`, for `frame`
@@ -404,7 +404,7 @@ def finished_lives(plan: StudyPlan, results: Mapping[str, CellResult]) -> list[F
             finished = [agent for agent in fresh if agent is not None]
             report = result.stream_report
             if fresh and len(finished) == len(fresh):
-                report = _with_fresh(report, finished)
+                report = with_fresh(report, finished)
             lives.append(FinishedLife(planned, result, report, len(finished)))
     return lives
 
@@ -416,13 +416,6 @@ def stream_frames(lives: Sequence[FinishedLife]) -> StreamFrames:
         frame([row for life in lives for row in _retention_rows(life)], _RETENTION),
         frame([row for life in lives for row in curve_rows(life.planned, life.result)], CURVES),
     )
-
-
-def _with_fresh(report: StreamReport, fresh: Sequence[CellResult]) -> StreamReport:
-    """The report with its fresh agents, one for each phase."""
-    costs = [result.online_regret for result in fresh if result.online_regret is not None]
-    known = len(costs) == len(fresh) and report.dynamic_regret is not None
-    return report.with_fresh([result.any_report for result in fresh], costs if known else None)
 
 
 def _life_rows(life: FinishedLife) -> Iterator[dict[str, Any]]:

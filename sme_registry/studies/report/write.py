@@ -28,9 +28,8 @@ from typing import NamedTuple
 import pandas as pd
 from markupsafe import Markup
 
-from sme_registry.diagnosis.subject import load_cell
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
-from sme_registry.explorer import explorer_page, facts, run_report
+from sme_registry.explorer import explorer_page, facts
 from sme_registry.io import check_writable, to_json, write_atomically
 from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
@@ -50,6 +49,7 @@ from sme_registry.studies.report.findings import THRESHOLDS, findings
 from sme_registry.studies.report.frames import StudyFrames, frame, load, records, runs_of
 from sme_registry.studies.report.tables import DIFFERENCES, analyse, differences
 from sme_registry.studies.report.texts import TextTable, comparison_tables, csv_tables, text_tables
+from sme_registry.studies.subject import find_result, load_cell
 
 DEFAULT_METRICS = tuple(metric.key for metric in metrics_of("score"))  # of comparisons
 FORMATS = ("html", "png", "pdf", "csv", "latex")
@@ -302,10 +302,7 @@ def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) ->
             continue
         name = key.removeprefix("sha256:")[:_DIGITS]
         try:
-            report = run_report(ledger.folder, key)
-        except SMEError:  # of another version: the page then lacks its regions
-            report = None
-        try:
+            report = find_result(ledger.folder, key).report
             content = explorer_page(facts(load_cell(ledger.folder, key), report=report))
         except SMEError:
             continue
