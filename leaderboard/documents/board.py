@@ -16,9 +16,9 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
+from pydantic import Field, field_validator
 
 from leaderboard.documents.signed import MAX_BYTES as MAX_SIGNED_BYTES
 from leaderboard.documents.signed import PublicKey, Receiver, SigningKey
@@ -97,6 +97,8 @@ class BoardDocument(Document):
       draws: number of bootstrap resamples.
     """
 
+    fields_added_later = ("suite_description", "suite_tags")
+
     schema_version: SchemaVersion = 1
     title: Annotated[str, Field(min_length=1, max_length=80)]
     track: Track = "open"
@@ -120,14 +122,6 @@ class BoardDocument(Document):
         except SpecError as error:
             raise ValueError(str(error)) from None
         return suite
-
-    @model_serializer(mode="wrap")
-    def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        for field in ("suite_description", "suite_tags"):
-            if not plain[field]:
-                del plain[field]
-        return plain
 
     @property
     def practice(self) -> bool:

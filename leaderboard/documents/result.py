@@ -21,9 +21,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
+from typing import Annotated, Literal, NamedTuple, Self, get_args
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
 from leaderboard.errors import CODES
 from sme_registry.spec.document import (
@@ -108,6 +108,8 @@ class RunScore(StrictModel):
       sketch: of results of earlier versions, 68 numbers by which copies are found, in base64.
     """
 
+    fields_added_later = ("rounding", "sketch", "actions")
+
     spec: Digest | None
     class_name: Name
     artefact: Digest | None
@@ -123,14 +125,6 @@ class RunScore(StrictModel):
     rounding: Real | None = None
     sketch: Annotated[str, Field(pattern=r"^([A-Za-z0-9+/]{363}=)?$")] = ""
     actions: Digest | None = None
-
-    @model_serializer(mode="wrap")
-    def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        for field in ("rounding", "sketch", "actions"):
-            if plain[field] in (None, ""):
-                del plain[field]
-        return plain
 
 
 class Estimate(StrictModel):
@@ -222,6 +216,8 @@ class Result(Document):
       isolation: of the sandbox, "bwrap" or "process"; empty where nothing ran.
     """
 
+    fields_added_later = ("isolation",)
+
     schema_version: SchemaVersion = 1
     submission: Digest
     suite: Digest
@@ -236,13 +232,6 @@ class Result(Document):
     oracle_like: bool = False
     versions: dict[str, str] = Field(default_factory=dict)
     isolation: Isolation = ""
-
-    @model_serializer(mode="wrap")
-    def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        if not self.isolation:
-            del plain["isolation"]
-        return plain
 
     @model_validator(mode="after")
     def _status_fits(self) -> Self:
