@@ -18,7 +18,7 @@ import os
 import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -85,16 +85,7 @@ class Bundle:
         return cls(folder, Signed[Submission].read(text))
 
     def artefact(self, digest: str) -> bytes:
-        """The bytes of an artefact that the submission names, of its digest and size."""
-        sizes = {
-            run.artefact.size
-            for run in self.signed.content.runs
-            if run.artefact is not None and run.artefact.sha256 == digest
-        }
-        if not sizes:
-            raise Rejection(
-                "artefact_missing", f"artefact={digest:.80}: no run of the submission names it."
-            )
+        """The bytes of an artefact of this digest."""
         name = f"{ARTEFACTS}/{hex_of(digest)}.onnx"
         data = _read(self.folder, name, MAX_ARTEFACT_BYTES)
         if data is None:
@@ -102,12 +93,10 @@ class Bundle:
                 "artefact_missing",
                 f"{name}: is missing from the bundle. Add it, or recreate the bundle.",
             )
-        if sizes != {len(data)} or sha256_of(data) != digest:
+        if sha256_of(data) != digest:
             raise Rejection(
                 "artefact_digest",
-                f"{name}: {len(data):,} bytes of {sha256_of(data)}: must be "
-                f"{' and '.join(f'{size:,}' for size in sorted(sizes))} bytes of {digest}. "
-                "Recreate the bundle.",
+                f"{name}: has the digest {sha256_of(data)}: must be {digest}. Recreate the bundle.",
             )
         return data
 
@@ -228,7 +217,7 @@ def _submission(
 
 def _training_facts(listed: list[SubmittedRun]) -> Training:
     """Facts of the training from the records of the runs; empty without records."""
-    known = [run.provenance for run in listed if run.provenance is not None]
+    known = [run for run in listed if run.versions]
     if not known:
         return Training()
     names = ("stable_baselines3", "torch", "sme_registry", "python")
@@ -295,24 +284,17 @@ def _refuse_existing(folder: Path, force: bool) -> None:
 
 
 @dataclass(frozen=True)
-class Provenance:
-    """How a run was trained, as its record says."""
-
-    versions: dict[str, str]  # of the packages that the policy depends on
-    settings: str  # algorithm, hyperparameters, action range and number of environments
-    seconds: float  # the training took
-
-
-@dataclass(frozen=True)
 class SubmittedRun:
-    """A run to submit."""
+    """A run to submit, and how it was trained, if there is a record of that."""
 
     source: str  # its name in errors
     spec: SMESpec
     seed: int
     steps: int
     policy: Path | None  # an .onnx or a .zip; None if the run failed
-    provenance: Provenance | None = None
+    versions: dict[str, str] = field(default_factory=dict)  # of the packages that it depends on
+    settings: str = ""  # algorithm, hyperparameters, action range and number of environments
+    seconds: float = 0.0  # the training took
 
 
 def runs_of(path: Path, suite: SuiteFile, algorithm: str | None = None) -> list[SubmittedRun]:
@@ -371,9 +353,9 @@ def _trained(folder: Path, record: RunRecord | None) -> SubmittedRun:
         f"{record.algorithm}, defaults{changes and f', but {changes}'}; actions in "
         f"{_RANGES[record.action_range]}; num_envs={record.num_envs}"
     )
-    provenance = Provenance(record.versions, settings, record.wall_seconds)
     return SubmittedRun(
-        str(folder), record.spec, record.seed, record.steps_done, folder / _MODEL, provenance
+        *(str(folder), record.spec, record.seed, record.steps_done, folder / _MODEL),
+        *(record.versions, settings, record.wall_seconds),
     )
 
 
@@ -416,8 +398,10 @@ def _cell(study: Path, status: studies.CellStatus) -> SubmittedRun:
     steps = max((cell.steps, *result.curve.steps))  # the last rollout can exceed the plan
     changed = to_json(cell.hyperparameters) if cell.hyperparameters else "default hyperparameters"
     settings = f"{cell.uses}, {changed}; actions in {_RANGES[cell.action_range]}; num_envs=1"
-    provenance = Provenance(result.versions, settings, result.timing.total)
-    return SubmittedRun(source, cell.spec, cell.seed, steps, policy, provenance)
+    return SubmittedRun(
+        *(source, cell.spec, cell.seed, steps, policy),
+        *(result.versions, settings, result.timing.total),
+    )
 
 
 def _table(path: Path, suite: SuiteFile) -> list[SubmittedRun]:

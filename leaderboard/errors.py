@@ -90,12 +90,7 @@ _MAX_MESSAGE = 2000
 
 
 class Rejection(SMEError):
-    """A submission or an artefact is rejected.
-
-    Args:
-      code: one of `CODES`.
-      message: field, value, what is allowed, what to do; cut to 2,000 characters.
-    """
+    """A submission or an artefact is rejected, for the reason of a code in `CODES`."""
 
     def __init__(self, code: str, message: str) -> None:
         if code not in CODES:
@@ -119,19 +114,11 @@ class ClockError(BoardError):
 
 
 class ScoringFault(BoardError):
-    """The machine could not score a submission: a lack of memory, a sandbox that does not start, …
-
-    The submission is not judged and keeps waiting.
-    """
+    """The machine could not score a submission, which is not judged and keeps waiting."""
 
 
 class NotPublishable(BoardError):
-    """The reference rows are missing or do not score 0 and 1, so no score is shown.
-
-    Args:
-      message: which row, and what is wrong with it.
-      waiting: whether the row only waits to be scored.
-    """
+    """A reference row is missing, waits or does not score 0 or 1, so no score is shown."""
 
     def __init__(self, message: str, *, waiting: bool = False) -> None:
         super().__init__(message)
@@ -139,12 +126,7 @@ class NotPublishable(BoardError):
 
 
 class TamperedError(SMEError):
-    """A board's files contradict its signed log.
-
-    Args:
-      where: the first altered file or value, such as `log/00000007.json`.
-      message: what is wrong with it.
-    """
+    """A board's files contradict its signed log, first in the file or value `where`."""
 
     def __init__(self, where: str, message: str) -> None:
         super().__init__(f"{where}: {message}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 from collections import Counter
@@ -36,16 +35,11 @@ from sme_registry.training import RunRecord
 def new_board_folder(board: str | Path) -> Path:
     """The folder of a board to create, which is not the name of a suite."""
     name = str(board)
-    if is_url(name) or Path(board).is_file():
+    suites = catalogue.entries(SuiteFile)
+    if is_url(name) or any(name in (file.name, file.versioned_name) for file in suites):
         raise OptionError(
-            f"{name!r}: must be a folder on this machine. To serve a board at a URL, create it and "
-            "run `sme-leaderboard serve`; for a suite's file, `sme-leaderboard init board --suite "
-            "FILE`."
-        )
-    if any(name in (file.name, file.versioned_name) for file in catalogue.entries(SuiteFile)):
-        raise OptionError(
-            f"{name!r}: must be a folder, and is a suite. Give `board --suite {name}`; for a "
-            f"folder of this name, .{os.sep}{name}"
+            f"{name!r}: must be a new folder on this machine. For a board of a suite, give `board "
+            f"--suite {name}`; for a URL, create the board and run `sme-leaderboard serve`."
         )
     return Path(board)
 
@@ -387,8 +381,6 @@ def gc(
       sme-leaderboard admin gc board --dry-run
     """
 
-    if math.isnan(older_than_hours):
-        raise BoardError("older_than_hours=nan: must be a number of hours, at least 0.")
     with Board.open(board) as store:
         garbage = collect_garbage(
             store, objects_older_than=older_than_hours * 3600.0, dry_run=dry_run

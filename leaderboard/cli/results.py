@@ -259,10 +259,7 @@ def show(
     if result.status == "rejected":
         print_line(f"[red]{escape(result.code)}[/]: {escape(result.message)}")
         return
-    out().print(_scores_table(result))
-    out().print(_class_table(result))
-    if result.oracle_like:
-        out().print("[yellow]oracle-like[/]: so close to π* that the method's code is required.")
+    _print_scores(result)
 
 
 def _public_view(board: str, id: str) -> PublicView:
@@ -306,7 +303,8 @@ def _print_submission(view: PublicView) -> None:
     print_pairs(f"[bold]{name}[/] by {submitter}: {status}", pairs)
 
 
-def _scores_table(result: Result) -> Table:
+def _print_scores(result: Result) -> None:
+    """Print the scores of a scored submission, and those of its classes."""
     assert result.scores is not None
     scores = Table(
         "normalised regret (0 optimal, 1 the constant ½)",
@@ -317,15 +315,13 @@ def _scores_table(result: Result) -> Table:
         rows[f"N in OOD {m}" if m else "N in WD"] = value
     for label, value in rows.items():
         scores.add_row(label, *(fixed(x, 4) for x in (value.value, *(value.interval or ()))))
-    return scores
-
-
-def _class_table(result: Result) -> Table:
     classes = Table("by class", {"class": "text", "runs": "number", "N₀": "number", "N̄": "number"})
     for member in result.classes:
-        scores = (fixed(member.wd_regret, 4), fixed(member.ood_regret, 4))
-        classes.add_row(escape(member.name), str(member.runs), *scores)
-    return classes
+        means = (fixed(member.wd_regret, 4), fixed(member.ood_regret, 4))
+        classes.add_row(escape(member.name), str(member.runs), *means)
+    out().print(scores, classes)
+    if result.oracle_like:
+        out().print("[yellow]oracle-like[/]: so close to π* that the method's code is required.")
 
 
 def find_entry(store: Store, id: str) -> EntryRow:

@@ -32,7 +32,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,26 +42,18 @@ from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation
 from leaderboard.gate.sandbox import Confined, widths
 from sme_registry import SMESpec, materialize
-from sme_registry.errors import OptionError, SMEError
+from sme_registry.diagnosis import load_policy
+from sme_registry.errors import OptionError, PolicyError, ResourceLimitError, SMEError
 from sme_registry.explorer import (
     GraphNode,
     NetworkProgram,
+    check_size,
+    explorer_page,
+    facts,
     program_of_graph,
 )
 from sme_registry.io import parse_json, require_packages
 from sme_registry.task import Layer
-
-if TYPE_CHECKING:
-    pass
-
-
-from sme_registry.diagnosis import load_policy
-from sme_registry.errors import PolicyError, ResourceLimitError
-from sme_registry.explorer import (
-    check_size,
-    explorer_page,
-    facts,
-)
 
 OPSET = 17
 _IR_VERSION = 8

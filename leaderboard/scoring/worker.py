@@ -38,7 +38,7 @@ from sme_registry.io.terminal import log_to_terminal
 _POLL_SECONDS = 0.2
 _STOP_SECONDS = 10.0
 _FUTILE_DEATHS = 5  # of processes, for each worker, that claimed nothing
-_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 300.0  # seconds, where every further process would fail
+_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 300.0  # seconds, after which a served board's scoring restarts
 # How long a scorer keeps a result that cannot be written: a command reports it, a server waits.
 _UNWRITTEN_SECONDS, _UNWRITTEN_SECONDS_SERVED = 30.0, 3600.0
 _log = logging.getLogger(__name__)
@@ -230,8 +230,7 @@ def run_scorers(
     """Score in several processes at once; one that dies is replaced and its submission rescored.
 
     Returns the number of submissions done. With `until_empty`, it ends when nothing can be scored
-    any more, even by another process; otherwise it replaces processes that die as long as it takes.
-    Ctrl-C stops all processes and releases their claims.
+    any more, even by another process. Ctrl-C stops all processes and releases their claims.
     """
     integer_in("workers", workers, 1, advice="Leave it out for one.")
     with work.board.open(path) as store:
@@ -281,7 +280,7 @@ class _Scorers:
         self._options, self._until_empty = options, options[0]
         self._running: dict[str, _Scorer] = {}
         self._futile_deaths, self._done = 0, store.queue.count("done")
-        self._paused_until, self._stopping = 0.0, False
+        self._stopping = False
 
     def are_needed(self) -> bool:
         """Whether a submission can be claimed, or is claimed, by a process of any command."""
@@ -291,13 +290,9 @@ class _Scorers:
     def fill(self) -> Iterator[int]:
         """Start processes up to the number of workers or of submissions; yields their ids."""
         queue = self._store.queue
-        while (
-            len(self._running) < self._workers
-            and time.monotonic() >= self._paused_until
-            and (
-                not self._until_empty
-                or (len(self._running) < queue.count("waiting") and queue.count("claimable"))
-            )
+        while len(self._running) < self._workers and (
+            not self._until_empty
+            or (len(self._running) < queue.count("waiting") and queue.count("claimable"))
         ):
             name = worker_name()
             with defer_interrupts(), block_interrupts():  # until the process is in `_running`
@@ -318,25 +313,19 @@ class _Scorers:
         return _Scorer(process, errors)
 
     def watch(self) -> None:
-        """Wait a moment, remove the processes that have ended, and pause if all fail."""
+        """Wait a moment, and remove the processes that have ended; an error if all fail."""
         sentinels = [scorer.process.sentinel for scorer in self._running.values()]
         connection.wait(sentinels, _POLL_SECONDS)
         deaths, error = self._remove_ended()
-        if error is not None and self._until_empty:
+        if error is not None:
             raise error
         previously, self._done = self._done, self._store.queue.count("done")
         self._futile_deaths = 0 if self._done > previously else self._futile_deaths + deaths
-        excess = self._futile_deaths - _FUTILE_DEATHS * self._workers
-        if not deaths or excess < 0:
-            return
-        if self._until_empty:
+        if deaths and self._futile_deaths >= _FUTILE_DEATHS * self._workers:
             raise BoardError(
                 f"{self._path}: {self._futile_deaths} scorers died and claimed nothing. "
                 "Check the system's log for the cause, such as a lack of memory."
             )
-        pause = min(_FIRST_PAUSE * 2.0 ** min(excess, 20), _LONGEST_PAUSE)
-        _log.error("%d scorers died; the next starts in %.0f s", self._futile_deaths, pause)
-        self._paused_until = time.monotonic() + pause
 
     def stop(self) -> None:
         """Interrupt all processes, and release their claims."""

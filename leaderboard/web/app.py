@@ -18,13 +18,14 @@ server keeps no sessions and sets no cookies; every request that changes the boa
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 import re
 import signal
 from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import Any
 
 import anyio
 import uvicorn
@@ -59,7 +60,7 @@ if find_spec("leaderboard.seasons") is not None:  # without them, a board has th
     _Board = SeasonStore
 
 _Render = Callable[[Pages, str], bytes]
-_PAGES_KEPT, _BYTES_KEPT = 256, 2**26
+_PAGES_KEPT = 256
 _HEALTH_SECONDS = 5.0
 _LOG_ENTRIES = 100
 _OBJECTS = 8  # uploads and downloads in memory at the same time
@@ -112,7 +113,6 @@ def create_app(
             SMEError: server.on_board_error,
         },
     )
-    app.state.scores = score_workers > 0  # see `server.on_board_error`
     app.add_middleware(server.SecurityHeaders)
     for track in tracks:
         app.router.routes.extend(track.routes)
@@ -258,17 +258,13 @@ class _Routes:
         self, request: Request, render: _Render, name: str, media_type: str
     ) -> Response:
         """A file, rendered once for each state of the board; 304 if the client has it."""
-        file = await to_thread.run_sync(self._pages.get, render, name, limiter=self._rendering)
-        headers = {"ETag": file.tag, "Cache-Control": "no-cache"}
+        get = self._pages.get
+        content, tag = await to_thread.run_sync(get, render, name, limiter=self._rendering)
+        headers = {"ETag": tag, "Cache-Control": "no-cache"}
         known = request.headers.get("If-None-Match", "").replace("W/", "")
-        if file.tag in (tag.strip() for tag in known.split(",")):
+        if tag in (tag.strip() for tag in known.split(",")):
             return Response(status_code=304, headers=headers)
-        return Response(file.content, headers=headers, media_type=media_type)
-
-
-class _CachedFile(NamedTuple):
-    content: bytes
-    tag: str
+        return Response(content, headers=headers, media_type=media_type)
 
 
 class _PageCache:
@@ -283,29 +279,21 @@ class _PageCache:
         # A copy without its key accepts no submissions.
         self._address = url if store.folder.key.is_file() else None
         self._state: tuple[Head, int, dict[str, int]] | None = None
-        self._files: dict[tuple[_Render, str], _CachedFile] = {}  # in the order of their last use
 
-    def get(self, render: _Render, name: str) -> _CachedFile:
+    def get(self, render: _Render, name: str) -> tuple[bytes, str]:
+        """A file and its tag."""
         queue = self._store.queue
         state = self._store.head, queue.count("faults"), queue.places()
         if state != self._state:
             self._state = state
-            self._pages = Pages(self._store, self._address, sections=self._sections)
-            self._files.clear()
-        file = self._files.pop((render, name), None) or _rendered(self._pages, render, name)
-        self._files[render, name] = file
-        while len(self._files) > _PAGES_KEPT or self._bytes > _BYTES_KEPT:
-            del self._files[next(iter(self._files))]
-        return file
-
-    @property
-    def _bytes(self) -> int:
-        return sum(len(file.content) for file in self._files.values())
+            pages = Pages(self._store, self._address, sections=self._sections)
+            self._rendered = functools.lru_cache(_PAGES_KEPT)(functools.partial(_rendered, pages))
+        return self._rendered(render, name)
 
 
-def _rendered(pages: Pages, render: _Render, name: str) -> _CachedFile:
+def _rendered(pages: Pages, render: _Render, name: str) -> tuple[bytes, str]:
     content = render(pages, name)
-    return _CachedFile(content, f'"{hashlib.sha256(content).hexdigest()[:32]}"')
+    return content, f'"{hashlib.sha256(content).hexdigest()[:32]}"'
 
 
 def _view(pages: Pages, id: str) -> bytes:

@@ -27,10 +27,7 @@ from typing import Any, NamedTuple
 from leaderboard.admission import upload_header
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
-from leaderboard.documents.result import (
-    EntryRow,
-    Result,
-)
+from leaderboard.documents.result import EntryRow, Result
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.errors import CODES, BoardError, NotPublishable, Rejection
@@ -69,25 +66,22 @@ def submit(
     bundle: str | os.PathLike[str],
     key: SigningKey,
     progress: Progress | None = None,
-    *,
-    insecure: bool = False,
 ) -> str:
     """Send a bundle's folder to a board, and return the submission's id; it is scored later.
 
     `key`, the submitter's, signs the uploads, and the submission if it is signed for no board yet.
-    `insecure` allows plain http to other machines, in a network that you trust.
     """
     content = Bundle.read(bundle)
     runs = content.signed.content.runs
     digests = dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact)
-    with ServedBoard(url, insecure=insecure) as served:
+    with ServedBoard(url) as served:
         signed = content.signed.for_receiver(served.receiver(), key)
         return served.send("/api/submissions", signed, digests, content.artefact, key, progress)
 
 
-def receiver_of(url: str, *, insecure: bool = False) -> Receiver:
+def receiver_of(url: str) -> Receiver:
     """A served board and its address, for which whatever is sent to it must be signed."""
-    with ServedBoard(url, insecure=insecure) as served:
+    with ServedBoard(url) as served:
         return served.receiver()
 
 
@@ -96,25 +90,23 @@ def page_of(url: str, id: str) -> str:
     return f"{url.rstrip('/')}/submissions/{_digits(id)}"
 
 
-def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
+def status(url: str, id: str) -> dict[str, Any]:
     """A submission as the board answers: with its `result`, or why it is `withheld`."""
-    with ServedBoard(url, insecure=insecure) as served:
+    with ServedBoard(url) as served:
         answer = served.request("GET", f"/api/submissions/{_digits(id)}")
     return answer_for(f"sha256:{_digits(id)}", answer, url)
 
 
-def board_document(url: str, *, insecure: bool = False) -> BoardDocument:
+def board_document(url: str) -> BoardDocument:
     """The definition of a served board: suite, protocol and limits."""
-    with ServedBoard(url, insecure=insecure) as served:
+    with ServedBoard(url) as served:
         return served.document()
 
 
-def withdraw(
-    url: str, id: str, key: SigningKey, reason: str = "", *, insecure: bool = False
-) -> None:
+def withdraw(url: str, id: str, key: SigningKey, reason: str = "") -> None:
     """Withdraw a submission that this key has signed; its page shows the reason."""
     id = f"sha256:{_digits(id)}"
-    with ServedBoard(url, insecure=insecure) as served:
+    with ServedBoard(url) as served:
         withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
         signed = withdrawal.signed(key, served.receiver())
         served.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
@@ -123,10 +115,10 @@ def withdraw(
 class ServedBoard:
     """A served board, whose errors are those of this module; a context manager."""
 
-    def __init__(self, url: str, *, insecure: bool = False) -> None:
+    def __init__(self, url: str) -> None:
         self.url = url
-        self._address = server_address(url, insecure=insecure).url
-        self._connection = Connection(url, insecure=insecure, patience=_PATIENCE)
+        self._address = server_address(url).url
+        self._connection = Connection(url, patience=_PATIENCE)
 
     def __enter__(self) -> ServedBoard:
         return self
@@ -244,7 +236,6 @@ def fetch(
     *,
     without_data: bool = False,
     most: int = MOST_BYTES,
-    insecure: bool = False,
     board: type[Store] = Store,
     parts: Sequence[Part] = (),
     progress: Callable[[str], None] | None = None,
@@ -255,7 +246,7 @@ def fetch(
     TamperedError is raised if the log is not signed by the board or has a gap, and a BoardError for
     everything else that the server must not send, or if the folder holds something else.
     """
-    with ServedBoard(url, insecure=insecure) as served:
+    with ServedBoard(url) as served:
         copy = _Copy(served, Path(folder), most, progress or (lambda _: None))
         copy.open()
         entries = copy.fetch_log()

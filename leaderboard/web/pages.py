@@ -22,12 +22,10 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import METRICS, RANKED, EntryRow, Estimate, Metric, Result
-from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import Submission
+from leaderboard.documents.result import METRICS, RANKED, EntryRow, Estimate, Metric
 from leaderboard.errors import CODES, NotPublishable
 from leaderboard.gate import networks
 from leaderboard.scoring import ranking
@@ -37,6 +35,7 @@ from leaderboard.web.tables import SHORT
 from sme_registry import SMESpec
 from sme_registry.explorer import STATIC
 from sme_registry.io import to_json
+from sme_registry.io.markup import environment
 
 _HERE = Path(__file__).parent
 LOG_ROWS = 200  # entries on a page of the log; a full page never changes again
@@ -80,7 +79,6 @@ class Pages:
         self._explorers = explorers
         self._address = address
         self.document = store.document
-        self._latest: tuple[str, tuple[Signed[Submission], Result | None]] | None = None
 
     @cached_property
     def entries(self) -> list[EntryRow]:
@@ -104,9 +102,10 @@ class Pages:
             return self._static.get(name)
         if path in self._definitions:  # without scores, and needed to train for the board
             return to_json(self._definitions[path]).encode()
-        if self.preparing and (path.endswith(".html") or folder == "submissions"):
-            return self._prepared(folder, name)
-        self.entries  # noqa: B018  raises if the board may not publish
+        if self.preparing and path in _NEED_SCORES:
+            return self.preparation().encode()
+        if not (self.preparing and (path.endswith(".html") or folder == "submissions")):
+            self.entries  # noqa: B018  raises if the board may not publish
         if folder in ("submissions", "results"):
             return self._document(folder, name)
         if folder == "explorers":
@@ -151,15 +150,6 @@ class Pages:
             },
             **{tab.page: partial(self._board, name) for name, tab in reversed(RANKED.items())},
         }
-
-    def _prepared(self, folder: str, name: str) -> bytes | None:
-        """A file without scores, while the reference rows wait."""
-        if folder == "submissions":
-            return self._document(folder, name)
-        path = f"{folder}/{name}" if folder else name
-        if path not in self._top:
-            return None
-        return (self.preparation() if path in _NEED_SCORES else self._top[path]()).encode()
 
     def _board(self, metric: Metric) -> str:
         tab = RANKED[metric]
@@ -212,7 +202,7 @@ class Pages:
     def _submission(self, id: str) -> str:
         """The page of a submission: waiting, scored, rejected or withdrawn."""
         entry = self._by_id[id]
-        signed, result = self._documents(id)
+        signed, result = self.store.submission(id), self.store.result(id)
         withheld = self.preparing and result is not None and result.scores is not None
         result = None if withheld else result
         withdrawal = self.store.withdrawal(id)
@@ -329,22 +319,14 @@ class Pages:
             return self._submission(id).encode()
         if kind != "json":
             return None
-        signed, result = self._documents(id)
-        document = signed if folder == "submissions" else result
+        document = self.store.submission(id) if folder == "submissions" else self.store.result(id)
         return None if document is None else to_json(document.to_dict()).encode()
-
-    def _documents(self, id: str) -> tuple[Signed[Submission], Result | None]:
-        """A submission and its result; the latest are kept, because three files need them."""
-        latest = self._latest  # read once: a server's threads share these pages
-        if latest is None or latest[0] != id:
-            latest = self._latest = id, (self.store.submission(id), self.store.result(id))
-        return latest[1]
 
     def _explored(self, id: str) -> list[int]:
         """The runs of a submission that have an explorer."""
         if not self._explorers or self._by_id[id].status != "scored":
             return []
-        runs = enumerate(self._documents(id)[0].content.runs)
+        runs = enumerate(self.store.submission(id).content.runs)
         return [n for n, run in runs if run.artefact is not None and run.spec in self._shown]
 
     def _explorer(self, name: str) -> bytes | None:
@@ -353,7 +335,7 @@ class Pages:
         id = f"sha256:{digits}"
         if id not in self._by_id or number not in map(str, self._explored(id)):
             return None
-        submission = self._documents(id)[0].content
+        submission = self.store.submission(id).content
         run, method = submission.runs[int(number)], submission.method
         assert run.artefact is not None  # it is explored
         data = self.store.objects.read(run.artefact.sha256)
@@ -372,11 +354,8 @@ class Pages:
     @cached_property
     def _static(self) -> dict[str, bytes]:
         """The files in static/, by name."""
-        files = _static(*self._folders)
-        if not self._explorers:
-            return files
-        of_explorers = STATIC.items()
-        return {**files, **{name: text.encode() for name, text in of_explorers}}
+        of_explorers = STATIC if self._explorers else {}
+        return _static(*self._folders) | {k: text.encode() for k, text in of_explorers.items()}
 
     @cached_property
     def _files(self) -> list[dict[str, Callable[[], str]]]:
@@ -434,8 +413,8 @@ class Pages:
 
     def render(self, template: str, **values: Any) -> str:
         """A page from a template, with what every page needs."""
-        environment = _environment(*self._folders)
-        return environment.get_template(template).render({**self._common, **values})
+        templates = _environment(*self._folders)
+        return templates.get_template(template).render({**self._common, **values})
 
     @property
     def _folders(self) -> list[Path]:
@@ -448,15 +427,8 @@ def content_type(path: str) -> str:
 
 @cache
 def _environment(*folders: Path) -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader([folder / "templates" for folder in folders]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        auto_reload=False,
-    )
-    environment.filters |= {
+    templates = environment(*(folder / "templates" for folder in folders), autoescape=True)
+    templates.filters |= {
         "day": tables.day,
         "hex": hex_of,
         "https_only": tables.https_only,
@@ -465,7 +437,7 @@ def _environment(*folders: Path) -> Environment:
         "short": tables.short,
         "steps": tables.steps_text,
     }
-    return environment
+    return templates
 
 
 @cache

@@ -12,9 +12,7 @@ import ipaddress
 import logging
 import re
 import socket
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +60,6 @@ STATUSES = {
 }
 """Any other code of a `Rejection` is 422, any other code is 400."""
 
-_RETRY_SECONDS = 5
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -170,9 +167,7 @@ async def on_board_error(request: Request, error: Exception) -> Response:
         return error_answer(request, "clock_wrong", f"{HTTP_CODES['clock_wrong']}.")
     if not isinstance(error, NotPublishable):
         raise error
-    waits = error.waiting and request.app.state.scores
-    headers = {"Retry-After": str(_RETRY_SECONDS)} if waits else None
-    return error_answer(request, "not_publishable", str(error), headers)
+    return error_answer(request, "not_publishable", str(error))
 
 
 def error_answer(request: Request, code: str, message: str, headers: Any = None) -> Response:
@@ -220,7 +215,6 @@ def metric_of(request: Request) -> Metric:
 
 _CONNECTIONS = 800  # and so fewer open files than the 1,024 that systems usually allow
 _HEAD_BYTES = 2**14
-_WRITERS = 8  # threads of `write_site` that wait for the disk
 
 
 def config_of(app: ASGIApp) -> uvicorn.Config:
@@ -282,25 +276,13 @@ def write_site(
     _refuse_board(out)
     pages = Pages(store, explorers=explorers, sections=sections)
     paths = list(pages.paths())
-
-    def write(path: str, content: bytes) -> None:
-        target = out / path
+    for done, path in enumerate(paths, start=1):
+        content, target = pages.read(path), out / path
+        assert content is not None, path
         if not (target.is_file() and target.read_bytes() == content):
             write_file(target, content)
-
-    # This thread renders, because it holds the store; the others wait for the disk.
-    with ThreadPoolExecutor(_WRITERS) as pool:
-        pending: deque[Future[None]] = deque()
-        for done, path in enumerate(paths, start=1):
-            content = pages.read(path)
-            assert content is not None, path
-            if path == "index.html":
-                _wait(pending, 0)  # every link of the page works once it exists
-            pending.append(pool.submit(write, path, content))
-            _wait(pending, 4 * _WRITERS)
-            if progress is not None:
-                progress(done, len(paths))
-        _wait(pending, 0)
+        if progress is not None:
+            progress(done, len(paths))
     return out / "index.html"
 
 
@@ -318,9 +300,3 @@ def _refuse_board(out: Path) -> None:
                 f"out={str(out)!r}: belongs to the board {above}, whose files the pages would "
                 f"replace. Give another folder, such as {above / 'site'}."
             )
-
-
-def _wait(pending: deque[Future[None]], left: int) -> None:
-    """Wait until at most `left` writes are pending, and raise their errors."""
-    while len(pending) > left:
-        pending.popleft().result()

@@ -243,12 +243,12 @@ def escape_latex(text: str) -> str:
     return escaped.replace("\0", r"$\tilde r$")
 
 
-def environment(folder: Path, *, autoescape: bool) -> Environment:
-    """The templates of a folder, with the filters of this module."""
+def environment(*folders: Path, autoescape: bool) -> Environment:
+    """The templates of folders, with the filters of this module."""
     import jinja2  # on first use: cards need none
 
     templates = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder),
+        loader=jinja2.FileSystemLoader(folders),
         autoescape=autoescape,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

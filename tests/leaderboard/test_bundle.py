@@ -10,7 +10,7 @@ import pytest
 from leaderboard.bundle import Bundle, make_bundle
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import MAX_BYTES, SigningKey
-from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Submission, Training
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Training
 from leaderboard.errors import Rejection
 from leaderboard.gate.networks import constant_onnx, optimal_onnx
 from sme_registry import SMESpec, save
@@ -124,9 +124,7 @@ def test_a_file_above_its_limit_is_not_read_to_its_end(bundle):
     refused("too_large", match, bundle.artefact, digest_of(bundle))
 
 
-def test_an_artefact_that_no_run_names_or_that_is_missing_is_refused(bundle):
-    for digest in ("sha256:" + "0" * 64, "../../etc/passwd", "sha256:../../../etc/passwd"):
-        refused("artefact_missing", "no run of the submission names it", bundle.artefact, digest)
+def test_an_artefact_that_is_missing_is_refused(bundle):
     artefact_path(bundle).unlink()
     missing = ("artefact_missing", "is missing from the bundle")
     refused(*missing, bundle.artefact, digest_of(bundle))
@@ -139,13 +137,7 @@ def test_bytes_that_are_not_the_signed_ones_are_refused(bundle):
     data = path.read_bytes()
     for changed in (data[:-1], data[:-1] + b"\xff"):
         path.write_bytes(changed)
-        match = "must be .* bytes of sha256:"
-        refused("artefact_digest", match, bundle.artefact, digest_of(bundle))
-    path.write_bytes(data)
-    submission = bundle.signed.content.to_dict()
-    submission["runs"][0]["artefact"]["size"] = 5
-    lying = Bundle(bundle.folder, Submission.from_dict(submission).signed(KEY))
-    refused("artefact_digest", "must be 5 bytes", lying.artefact, digest_of(bundle))
+        refused("artefact_digest", "must be sha256:", bundle.artefact, digest_of(bundle))
 
 
 def replaced_by_link(path, target):

@@ -230,18 +230,6 @@ def test_who_waits_sees_a_place_in_the_queue(tmp_path):
         assert store.queue.claim("scorer").id == ids[0]
 
 
-def test_what_does_not_last_is_announced_only_by_a_server_that_scores(store, monkeypatch):
-    monkeypatch.setattr(app, "background_scorers", lambda *_: contextlib.nullcontext())
-    with serving(store.folder.path, score_workers=1) as url:  # a reference row is missing
-        assert "refresh" not in HTTP.get(url, headers=BROWSER).text
-    admission.submit_references(store)
-    for workers in (0, 1):
-        with serving(store.folder.path, score_workers=workers) as url:
-            answer = HTTP.get(f"{url}/api/board", headers=JSON)
-        assert refusal(answer) == (503, "not_publishable")
-        assert ("Retry-After" in answer.headers) == (workers == 1)
-
-
 def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path):
     """Never at the address that a request's Host header claims."""
     forged = {**BROWSER, "Host": "evil.example"}
