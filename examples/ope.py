@@ -4,7 +4,7 @@
     python examples/ope.py --env Default --nu 1 --seeds 0 1 2
 
 A behaviour policy of quality ν collects 20,000 transitions. From these alone, FQE estimates the
-return of other policies. `exact_return` then computes what they really earn in the task.
+return of other policies. `sme_registry.values` then computes what they really earn in the task.
 
 This FQE is linear in random ReLU features φ of (observation, action), so each iteration is one
 solve with a matrix that is inverted once:
@@ -30,7 +30,7 @@ from collections.abc import Callable
 import numpy as np
 
 import sme_registry
-from sme_registry.datasets import DatasetRecipe, Transitions, collect, exact_return
+from sme_registry.datasets import DatasetRecipe, Transitions, collect
 from sme_registry.evaluation import reference_policy
 
 FEATURES, RIDGE, GAMMA, ITERATIONS, STARTS = 400, 1e-3, 0.9, 60, 1000
@@ -97,9 +97,10 @@ def compare(spec: sme_registry.SMESpec, nu: float, seed: int, rows: int) -> dict
     observations = np.concatenate([starts, np.zeros((STARTS, 2))], axis=1).astype(np.float32)
     values = {}
     for name, policy in policies(spec).items():
-        exact = exact_return(policy, spec, states=starts, gamma=GAMMA).over_states()[1]
-        estimate = float(fqe.value(policy, observations).mean())
-        values[name] = [estimate, float(exact.mean), float(exact.low), float(exact.high)]
+        exact = sme_registry.values(spec, policy, starts, gamma=GAMMA)
+        arm = 1.96 * float(exact.std()) / STARTS**0.5
+        estimate, mean = float(fqe.value(policy, observations).mean()), float(exact.mean())
+        values[name] = [estimate, mean, mean - arm, mean + arm]
     return values
 
 

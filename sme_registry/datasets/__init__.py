@@ -19,7 +19,6 @@ from sme_registry.datasets.storage import (
 )
 from sme_registry.datasets.transitions import (
     Transitions,
-    exact_return,
     positions,
     replay,
     to_d3rlpy,
@@ -33,7 +32,6 @@ __all__ = [
     "SealedDataset",
     "Transitions",
     "collect",
-    "exact_return",
     "make_dataset",
     "open_dataset",
     "positions",

@@ -1,42 +1,23 @@
-"""`Transitions`: a data set as aligned arrays, and what is known exactly about them and from them.
+"""`Transitions`: a data set as aligned arrays, and its check against its task.
 
 `N` transitions, `S` state_dim, `A` action_dim, `n` agents (1 without a team), `m` distractors (0
 without `observation`), `O` = S + m + 1 + n entries of an observation, T horizon.
-
-Off-policy evaluation estimates from data what a policy would earn. Here the task is known and its
-transitions are deterministic, so `exact_return` computes it, from any of `M` states:
-
-    G(s, t, r_cum) = Σ_i γ^i R_{t+1+i}     from the step after t to the end of the episode; γ = 1
-                                           for the undiscounted return
-
-R is the reward as paid, so r_cum, k, r_min, D and the horizon all matter. Exact means up to
-rounding, which the transition doubles at each step, and networks round by the size of a batch.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import stdtrit
 
 from sme_registry.datasets.documents import DatasetRecipe
-from sme_registry.envs.arguments import initial_states, to_unit
-from sme_registry.envs.batch import Batch
-from sme_registry.errors import FingerprintMismatchError, OptionError, SpecError, StateError
-from sme_registry.evaluation.policies import as_policy
+from sme_registry.errors import FingerprintMismatchError
 from sme_registry.evaluation.regions import expansion
-from sme_registry.evaluation.rollouts import MOST_ENVS
-from sme_registry.evaluation.rollouts import rollouts as run_rollouts
-from sme_registry.io import integer_in, number_in
 from sme_registry.spec import SMESpec
-from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import Task, step
-from sme_registry.task.loading import load_task
 from sme_registry.task.task import Array, Indices, Mask, Observation, Step
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -45,7 +26,6 @@ TOLERANCE = 1e-12
 # Of r_cum/k of a trajectory that begins within an episode, and of what a mixing shows: both are
 # stored as float32.
 _ROUNDED = 1e-6
-_CONFIDENCE = 0.95
 
 
 class AlignedArrays:
@@ -303,108 +283,13 @@ def _same(
         )
 
 
-class ReturnEstimate(NamedTuple):
-    """A mean and its 95 % interval, each a number or `[M]`; an exact value has zero width."""
-
-    mean: Any
-    low: Any
-    high: Any
-
-
-@dataclass(frozen=True, eq=False)
-class ExactReturn:
-    """The returns of a policy from `M` states, each with a mean, low and high of `[M]`.
-
-    `lengths` `[M]` are the mean steps to the end of the episode, `similarity` `[M]` the mean r̃ over
-    them, and `rollouts` the episodes from each state.
-    """
-
-    undiscounted: ReturnEstimate
-    discounted: ReturnEstimate
-    lengths: Array
-    similarity: Array
-    gamma: float
-    rollouts: int
-
-    def over_states(self) -> tuple[ReturnEstimate, ReturnEstimate]:
-        """The mean over all states, undiscounted and discounted, with its interval.
-
-        The states must be independent draws: for rows of the same trajectories it is too narrow.
-        """
-        if len(self.lengths) < 2:
-            raise OptionError("states: an interval over states requires at least 2 of them.")
-        return _interval(self.undiscounted.mean), _interval(self.discounted.mean)
-
-
-def exact_return(
-    policy: Any,
-    spec: SpecLike,
-    *,
-    states: npt.ArrayLike,
-    t: npt.ArrayLike = 0,
-    r_cum: npt.ArrayLike = 0.0,
-    actions: npt.ArrayLike | None = None,
-    gamma: float = 0.99,
-    rollouts: int = 1,
-    action_range: str | None = None,
-) -> ExactReturn:
-    """Run a policy from `M` states of a single-agent task to the end of the episode.
-
-    Args:
-      states: `[M, S]` in [0, 1]; `Transitions.states` are exact, its observations are rounded.
-      t: `[M]` or one number, steps completed before, in [0, T).
-      r_cum: `[M]` or one number, the rewards since the last payout, in [0, t mod k].
-      actions: `[M, A]` in [0, 1], executed in the first step instead of the policy's. The return
-        is then Q(s, a) instead of V(s).
-      gamma: γ in [0, 1] of the discounted return.
-      rollouts: episodes from each state: 1 for a deterministic policy, whose return is exact; more
-        for a stochastic one, distractors or noise, whose mean gets a 95 % interval (Student's t).
-      action_range: of the policy's actions; None takes its own, and "unit" for a callable.
-
-    Examples:
-      >>> from sme_registry.datasets import exact_return, open_dataset, positions
-      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
-      >>> where = positions(data.transitions(), data.recipe.spec, [0, 90])
-      >>> result = exact_return("optimal", data.recipe.spec, **where)
-      >>> result.undiscounted.mean.round(3).tolist()
-      [100.0, 10.0]
-    """
-    task = load_task(spec)
-    if task.spec.team is not None:
-        raise SpecError("team: must be null here. Give a single-agent task.")
-    gamma = number_in("gamma", gamma, 0.0, 1.0)
-    rollouts = integer_in("rollouts", rollouts, 1, 10**6)
-    checked_policy = as_policy(policy, task.spec, action_range=action_range)
-    s, steps, accumulated = _starts(task.spec, states, t, r_cum)
-    first = None if actions is None else _first_actions(actions, (len(s), task.spec.action_dim))
-    if rollouts == 1:
-        _check_deterministic(checked_policy, task, s, steps, accumulated)
-    results = [
-        run_rollouts(
-            checked_policy, task, s, t=steps, r_cum=accumulated, actions=first, gamma=gamma,
-            seed=seed,
-        )
-        for seed in range(rollouts)
-    ]  # fmt: skip
-    lengths = np.stack([result.length for result in results])
-    similarities = [result.similarity for result in results]
-    return ExactReturn(
-        undiscounted=_interval(np.stack([result.episode_return for result in results])),
-        discounted=_interval(np.stack([result.discounted_return for result in results])),
-        lengths=lengths.mean(axis=0),
-        similarity=np.average(similarities, axis=0, weights=lengths),
-        gamma=gamma,
-        rollouts=rollouts,
-    )
-
-
 def positions(
     transitions: Transitions, spec: SMESpec, rows: npt.ArrayLike | None = None
 ) -> dict[str, Any]:
-    """The states, times and accumulated rewards of rows of a data set, for `exact_return`.
+    """The states, times and accumulated rewards of rows of a data set, for `sme_registry.values`.
 
-    `rows` are indices or a mask; None for all. `states` `[M, S]` and `t` `[M]` are exact, `r_cum`
-    `[M]` is as an observation stores it, to a relative precision of 6e-8.
+    `rows` are indices or a mask; None for all. `states` `[M, S]` and `t` `[M]` are exact, those
+    accumulated `[M]` as an observation stores them, to a relative precision of 6e-8.
 
     Examples:
       >>> from sme_registry.datasets import open_dataset, positions
@@ -415,67 +300,5 @@ def positions(
     chosen = slice(None) if rows is None else np.asarray(rows)
     observed = transitions.observations[chosen].astype(np.float64)
     t = np.rint(observed[:, -2] * spec.horizon).astype(np.int64)
-    r_cum = np.minimum(observed[:, -1] * spec.k, t % spec.k)
-    return {"states": transitions.states[chosen], "t": t, "r_cum": r_cum}
-
-
-def _starts(
-    spec: SMESpec, states: npt.ArrayLike, t: npt.ArrayLike, r_cum: npt.ArrayLike
-) -> tuple[Array, Indices, Array]:
-    """Checked states, times and accumulated rewards."""
-    T, M = spec.horizon, len(states) if isinstance(states, np.ndarray | list | tuple) else 0
-    s = initial_states(states, (max(1, M), spec.state_dim), "states")
-    try:
-        steps, owed = (np.broadcast_to(np.asarray(x, np.float64), (M,)).copy() for x in (t, r_cum))
-    except (TypeError, ValueError):
-        raise StateError(
-            f"t={t!r:.60}, r_cum={r_cum!r:.60}: each must be one number, or of shape ({M},)."
-        ) from None
-    valid = (steps == np.rint(steps)) & (steps >= 0) & (steps < T)
-    if not valid.all():
-        raise StateError(f"t={steps[~valid][0]:g}: must be an integer in [0, {T}).")
-    since = steps % spec.k
-    valid = (owed >= 0) & (owed <= since + _ROUNDED)
-    if not valid.all():
-        raise StateError(
-            f"r_cum={owed[~valid][0]:g}: must be in [0, {since[~valid][0]:g}] at "
-            f"t={steps[~valid][0]:g}, the number of steps since the last payout (k={spec.k})."
-        )
-    return s, steps.astype(np.int64), owed
-
-
-def _first_actions(actions: npt.ArrayLike, shape: tuple[int, int]) -> Array:
-    array = to_unit(actions, shape, rescaled=False)
-    if not ((array >= 0) & (array <= 1)).all():
-        raise OptionError("actions: must be finite numbers in [0, 1]. Clip them.")
-    return array
-
-
-def _check_deterministic(
-    policy: Callable[[Observation], npt.ArrayLike], task: Task, s: Array, t: Indices, r_cum: Array
-) -> None:
-    """Raise if the return of one episode from a state is not the only one that it can have."""
-    batch = Batch(task, min(len(s), MOST_ENVS))
-    batch.place(s[:MOST_ENVS], t[:MOST_ENVS], r_cum[:MOST_ENVS, None])
-    reason = ""
-    if task.spec.noise is not None:
-        reason = "the task has noise"
-    elif task.spec.distractors:
-        reason = f"the task has {task.spec.distractors} distractors, which are drawn at random"
-    elif not np.array_equal(policy(batch.observe()), policy(batch.observe())):
-        reason = "the policy is stochastic"
-    if reason:
-        raise OptionError(
-            f"rollouts=1: {reason}, so the return of one episode is not exact. Give rollouts=30 or "
-            "more for a mean with its interval."
-        )
-
-
-def _interval(samples: Array) -> ReturnEstimate:
-    """Mean over the first axis and its Student's t interval; of one sample, the sample."""
-    count, mean = len(samples), samples.mean(axis=0)
-    if count == 1:
-        return ReturnEstimate(mean, mean, mean)
-    error = samples.std(axis=0, ddof=1) / np.sqrt(count)
-    half = stdtrit(count - 1, 0.5 + _CONFIDENCE / 2) * error
-    return ReturnEstimate(mean, mean - half, mean + half)
+    accumulated = np.minimum(observed[:, -1] * spec.k, t % spec.k)
+    return {"states": transitions.states[chosen], "t": t, "accumulated": accumulated}
