@@ -230,7 +230,7 @@ class StreamReport(ReportFile):
             columns["learning transfer"] = transfers, training.learning_transfer
         table = Table(
             "Online regret: mean of 1 − step reward over the steps of each visit",
-            {"": "name"} | {escape(name): "number" for name in columns},
+            {"": "name"} | dict.fromkeys(columns, "number"),
         )
         for v, label in enumerate(self._visit_labels):
             row = (by_visit[v] if v < len(by_visit) else None for by_visit, _ in columns.values())

@@ -1,46 +1,35 @@
-"""Tables for terminals and notebooks, text for LaTeX, and Jinja2 templates; all text is escaped.
-
-No cell of a table is cut and no column dropped. In a narrow terminal Rich wraps columns of text,
-then a table loses its lines, and at last each row becomes a block. Output that is no terminal has
-one line per row, for `grep` and `awk`. Cards for notebooks have no scripts.
-"""
+"""Tables for terminals and notebooks, text for LaTeX, and Jinja2 templates; all text is escaped."""
 
 from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from rich import box, markup
-from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.padding import Padding
+from rich.measure import measure_renderables
 from rich.table import Table as RichTable
 from rich.text import Text
+
+from sme_registry.io.system import visible
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-
-class TableColumn(NamedTuple):
-    """A column, and how it is set: as a name, a number or a text."""
-
-    heading: str
-    kind: str
-
-
-class Row(NamedTuple):
-    """A row's cells, and Rich's style of all of them."""
-
-    cells: tuple[Text, ...]
-    style: str
+_UNLIMITED = 100_000  # columns
 
 
 class Table:
-    """A table that fits its console."""
+    """A table of which no cell is cut and no column dropped.
+
+    Each column has a heading and a kind, "name", "number" or "text"; only texts are wrapped. A
+    narrow terminal shows it without lines, and then as wrapped text. Output that is no terminal has
+    one line per row, for `grep` and `awk`.
+    """
 
     def __init__(
         self,
@@ -50,10 +39,10 @@ class Table:
         *,
         caption: str = "",
     ) -> None:
-        self.title, self.caption = title, caption
-        self.columns = [TableColumn(heading, kind) for heading, kind in columns.items()]
-        self.rows: list[Row | None] = []
-        """None separates sections."""
+        self.title, self.caption, self.grid = title, caption, RichTable()
+        for heading, kind in columns.items():
+            justify: Any = "right" if kind == "number" else "left"
+            self.grid.add_column(Text(heading), justify=justify, no_wrap=kind != "text")
         for row in rows:
             self.add_row(*row)
 
@@ -69,89 +58,37 @@ class Table:
 
     def add_row(self, *cells: str, style: str | None = None) -> None:
         """Add a row; missing cells are empty."""
-        missing = ("",) * (len(self.columns) - len(cells))
-        texts = tuple(Text.from_markup(cell, emoji=False) for cell in (*cells, *missing))
-        self.rows.append(Row(texts, style or ""))
+        self.grid.add_row(*map(_text, cells), style=style)
 
     def add_section(self) -> None:
-        self.rows.append(None)
+        self.grid.add_section()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if self.title:
-            yield Text.from_markup(self.title, style="italic", emoji=False)
-        if console.is_terminal:
-            yield from self._fitted(options.max_width)
-        else:
-            yield Text("\n".join(self._lines()), no_wrap=True, overflow="ignore")
-        if self.caption:
-            yield Text.from_markup(self.caption, style="dim italic", emoji=False)
-
-    def _fitted(self, width: int) -> RenderResult:
-        """The table with lines or without, where no word is broken; else blocks."""
-        least, n = sum(map(self._least_width, range(len(self.columns)))), len(self.columns)
-        if least + 3 * n + 1 <= width:
-            yield self._drawn(box.HEAVY_HEAD)
-        elif least + n <= width:
-            yield self._drawn(None)
-        else:
-            yield from self._blocks()
-
-    def _cells(self, i: int) -> list[str]:
-        return [row.cells[i].plain for row in self.rows if row is not None]
-
-    def _least_width(self, i: int) -> int:
-        """The width of a column in which no word of its texts is broken, and no name or number."""
-        heading, kind = self.columns[i]
-        texts = [heading, *self._cells(i)]
-        if kind == "text":
-            texts = [word for text in texts for word in text.split()]
-        return max(map(_width, texts), default=0)
-
-    def _drawn(self, lines: box.Box | None) -> RichTable:
-        padding = (0, 1) if lines else (0, 1, 0, 0)
-        table = RichTable(box=lines, padding=padding, pad_edge=bool(lines))
-        for i, (heading, kind) in enumerate(self.columns):
-            table.add_column(
-                heading,
-                justify="right" if kind == "number" else "left",
-                no_wrap=kind != "text",
-                min_width=self._least_width(i),
-            )
-        for row in self.rows:
-            if row is not None:
-                table.add_row(*row.cells, style=row.style)
-            elif lines:
-                table.add_section()
-            else:
-                table.add_row()
-        return table
-
-    def _blocks(self) -> RenderResult:
-        """Each row as a block: its name, and a line for each other cell."""
-        for row in filter(None, self.rows):
-            yield Text.assemble(row.cells[0], style=f"bold {row.style}")
-            for (heading, _), text in zip(self.columns[1:], row.cells[1:], strict=True):
-                if text:
-                    name = Text(f"{' '.join(heading.split())} ", style="dim")
-                    line = Text.assemble(name, Text(", ").join(text.split("\n")))
-                    yield Padding(line, (0, 0, 0, 2))
-
-    def _lines(self) -> Iterator[str]:
-        """The lines of the table as plain text of full width."""
-        widths = [
-            max(map(_width, [heading, *self._cells(i)]))
-            for i, (heading, _) in enumerate(self.columns)
+            yield _text(self.title, "italic")
+        width = options.max_width if console.is_terminal else 0
+        options, grid = options.update(width=_UNLIMITED), self.grid
+        sizes = [
+            (measure_renderables(console, options, [column.header, *column.cells]), column.no_wrap)
+            for column in grid.columns
         ]
-        header = tuple(Text(heading) for heading, _ in self.columns)
-        for row in (Row(header, ""), *self.rows):
-            if row is None:
-                yield ""
-                continue
-            parts = [cell.plain.split("\n") for cell in row.cells]
-            for line in itertools.zip_longest(*parts, fillvalue=""):
-                cells = zip(line, widths, self.columns, strict=True)
-                padded = (_padded(text, width, column.kind) for text, width, column in cells)
-                yield "  ".join(padded).rstrip()
+        least = sum(size.maximum if whole else size.minimum for size, whole in sizes)
+        has_lines = least + 3 * len(sizes) + 1 <= width
+        grid.box, grid.pad_edge = box.HEAVY_HEAD if has_lines else None, has_lines
+        grid.padding = (0, 1) if has_lines else (0, 1, 0, 0) if width else (0, 2, 0, 0)
+        if least + len(sizes) <= width:
+            yield grid
+        else:
+            lines = console.render_lines(grid, options, pad=False)
+            plain = ("".join(part.text for part in line).rstrip() for line in lines)
+            yield Text("\n".join(plain))
+        if self.caption:
+            yield _text(self.caption, "dim italic")
+
+
+def _text(markup: str, style: str = "") -> Text:
+    # Before it is measured: escapes are longer.
+    return Text.from_markup(visible(markup), style=style, emoji=False)
 
 
 def _cell(value: object) -> str:
@@ -162,15 +99,6 @@ def _cell(value: object) -> str:
 
 def _starts_as_number(cell: str) -> bool:
     return not cell or cell.lstrip("+-−")[:1].isdecimal()
-
-
-def _width(text: str) -> int:
-    return max(map(cell_len, text.split("\n")))
-
-
-def _padded(text: str, width: int, kind: str) -> str:
-    space = " " * (width - cell_len(text))
-    return space + text if kind == "number" else text + space
 
 
 # Notebooks have rules of their own for tables.
@@ -194,19 +122,16 @@ def folded(summary: str, *parts: str) -> str:
 
 def table_html(table: Table) -> str:
     """A table of the terminal; of Rich's styles it keeps bold text."""
-    kinds = [column.kind for column in table.columns]
-    heading = "".join(f"<th>{escape(column.heading)}</th>" for column in table.columns)
-    rows = [row for row in table.rows if row is not None]
-    lines = [heading]
-    for row in rows[:_MOST_ROWS]:
-        bold = "bold" in row.style
-        cells = zip(kinds, row.cells, strict=True)
-        lines.append("".join(f"<td class={kind}>{_html(cell, bold)}</td>" for kind, cell in cells))
-    if len(rows) > _MOST_ROWS:
-        lines.append(f"<td>… {len(rows) - _MOST_ROWS:,} more</td>")
-    title, caption = (
-        _html(Text.from_markup(text, emoji=False)) for text in (table.title, table.caption)
-    )
+    columns, styles = table.grid.columns, [str(row.style) for row in table.grid.rows]
+    classes = ["number" if column.justify == "right" else "text" for column in columns]
+    lines = ["".join(f"<th>{_html(column.header)}</th>" for column in columns)]
+    rows = zip(styles, *(column.cells for column in columns), strict=True)
+    for style, *cells in itertools.islice(rows, _MOST_ROWS):
+        bold, row = "bold" in style, zip(classes, cells, strict=True)
+        lines.append("".join(f"<td class={kind}>{_html(cell, bold)}</td>" for kind, cell in row))
+    if len(styles) > _MOST_ROWS:
+        lines.append(f"<td>… {len(styles) - _MOST_ROWS:,} more</td>")
+    title, caption = (_html(_text(text)) for text in (table.title, table.caption))
     body = "".join(f"<tr>{line}</tr>" for line in lines)
     return f"<table><caption>{title}</caption>{body}</table><small>{caption}</small>"
 
@@ -219,12 +144,12 @@ def pairs_html(title: str, pairs: Mapping[str, Any]) -> str:
     return f"<table><caption>{escape(title)}</caption>{rows}</table>"
 
 
-def _html(text: Text, bold: bool = False) -> str:
+def _html(text: Any, bold: bool = False) -> str:
     return "".join(
         f"<b>{escape(part.text)}</b>"
         if bold or (part.style is not None and part.style.bold)
         else escape(part.text)
-        for part in text.render(_CONSOLE)
+        for part in (text or Text()).render(_CONSOLE)  # a missing cell is ""
     )
 
 

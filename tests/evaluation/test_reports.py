@@ -316,7 +316,7 @@ def test_a_notebook_shows_a_reports_table_and_a_line_elsewhere(report):
     assert f"WD regret {report.wd_regret:.3f}" in repr(report)
     html = report._repr_html_()
     rows = html.split("<tr")[1:]
-    assert len(rows) == 1 + sum(row is not None for row in report.tables()[0].rows)
+    assert len(rows) == 1 + len(report.tables()[0].grid.rows)
     assert all(row.count("</td>") == 7 for row in rows[1:])
     assert f"{report.regions[5].normalised_regret:.3f}" in html
     escaped = report.model_copy(update={"policy": "<b>[bold]"})._repr_html_()
