@@ -17,7 +17,7 @@ in pairs: on the same draw of a level with the same seed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -29,18 +29,18 @@ from sme_registry.profiles.levels import AXES, DEFAULT, Axis, plan_file
 from sme_registry.spec import StudyAlgorithm
 from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
 from sme_registry.spec.study import PlannedCell
-from sme_registry.statistics import Array, iqm
+from sme_registry.statistics import Array, Statistic, iqm
 from sme_registry.studies.report.analysis import ENOUGH_RUNS, Bootstrap
 from sme_registry.studies.report.design import METRICS
 from sme_registry.studies.report.findings import THRESHOLDS
 from sme_registry.studies.report.tables import paired
-from sme_registry.studies.result import CellFailure, CellResult
+from sme_registry.studies.result import CellResult
 
 REFERENCES = Path(__file__).parent / "references"
 UNLEARNT = THRESHOLDS["unlearnt"]
 DIGITS = 6
 _HALF = 0.5
-_COMPARED = ("PPO", "TD3", "SAC")  # in sentences; others are in figures and tables
+COMPARED = "PPO", "TD3", "SAC"  # in sentences; others are in figures and tables
 
 
 class ProfileRow(StrictModel):
@@ -82,31 +82,23 @@ class ProfileFailure(StrictModel):
 
 
 class DrawEstimate(NamedTuple):
-    """A number over draws with its 95 % interval; NaN where it is unknown."""
+    """A number over draws with its 95 % interval; NaN where it is unknown.
+
+    A difference of N₀ of two algorithms is over pairs of runs, with the verdict on the first.
+    """
 
     value: float = math.nan
     low: float = math.nan
     high: float = math.nan
     draws: int = 0
+    verdict: str = ""
 
     def __str__(self) -> str:
-        return self.text()
-
-    def text(self, number: Callable[[float], str] = fixed) -> str:
         if not self.draws:
             return "–"
-        ends = "" if math.isnan(self.low) else f" [{number(self.low)}, {number(self.high)}]"
-        return number(self.value) + ends
-
-
-class Contrast(NamedTuple):
-    """The difference of N₀ of two algorithms over pairs of runs, and the verdict on the first."""
-
-    difference: DrawEstimate
-    verdict: str
-
-    def __str__(self) -> str:
-        return self.difference.text(signed)
+        text = signed if self.verdict else fixed
+        ends = "" if math.isnan(self.low) else f" [{text(self.low)}, {text(self.high)}]"
+        return text(self.value) + ends
 
 
 class Profile(StrictModel):
@@ -197,20 +189,15 @@ class Profile(StrictModel):
 
     def robustness(self, axis: Axis) -> DrawEstimate:
         """What is kept of the performance at the harder levels, over draws that have all levels."""
-        levels = [self.values(name) for name in (axis.base, *axis.harder) if self.values(name)]
-        complete = set[int].intersection(*map(set, levels)) if len(levels) > 1 else set()
-        known = axis.base in self.classes and len(levels) == len(self._asked(axis))
-        runs = np.array([[of[run] for of in levels] for run in sorted(complete if known else ())])
-        if len(runs) and float(iqm(runs)[0]) >= UNLEARNT:
+        levels = [self.values(name) for name in axis.levels if name in self.classes]
+        known = axis.base in self.classes and len(levels) > 1
+        draws = sorted(set[int].intersection(*map(set, levels))) if known else []
+        runs = np.array([[of_level[draw] for of_level in levels] for draw in draws])
+        if draws and float(iqm(runs)[0]) >= UNLEARNT:
             runs = runs[:0]
-        return self._estimate(runs, _kept, "robustness", axis.base, *axis.harder)
+        return self._estimate(runs, _kept, "robustness", *axis.levels)
 
-    def _asked(self, axis: Axis) -> list[str]:
-        return [name for name in axis.levels if name in self.classes]
-
-    def _estimate(
-        self, runs: Array, statistic: Callable[[Any], Array], *place: str
-    ) -> DrawEstimate:
+    def _estimate(self, runs: Array, statistic: Statistic, *place: str) -> DrawEstimate:
         if not len(runs):
             return DrawEstimate()
         bootstrap = Bootstrap(self.plan_digest)
@@ -225,35 +212,32 @@ class Profile(StrictModel):
         steps = [math.inf if row.steps_to_half is None else row.steps_to_half for row in rows]
         return float(np.quantile(steps, 0.5, method="higher"))
 
-    def against(self, other: Profile, names: Sequence[str]) -> Contrast | None:
-        """The difference of N₀ from another profile's over levels; None without a pair."""
-        pairs = {name: self._pairs(other, name) for name in names}
-        pairs = {name: both for name, both in pairs.items() if len(both)}
+    def contrasts(self, other: Profile) -> dict[str, DrawEstimate]:
+        """The differences on the default, and over the harder levels of each axis, by label."""
+        places = {"the default": [DEFAULT]} | {axis.label: axis.harder for axis in AXES}
+        known = {label: self._against(other, names) for label, names in places.items()}
+        return {label: difference for label, difference in known.items() if difference.draws}
+
+    def _against(self, other: Profile, names: Sequence[str]) -> DrawEstimate:
+        pairs = {}
+        for name in names:
+            ours, theirs = self.values(name), other.values(name)
+            if draws := sorted(ours.keys() & theirs.keys()):
+                pairs[name] = np.array([[ours[draw], theirs[draw]] for draw in draws])
         if not pairs:
-            return None
+            return DrawEstimate()
         place = "profile", other.name, *pairs
         *_, value, low, high, count, _, verdict = paired(
             pairs, METRICS["wd_regret"], Bootstrap(self.plan_digest), *place
         )
-        return Contrast(DrawEstimate(value, low, high, count), verdict)
-
-    def _pairs(self, other: Profile, name: str) -> Array:
-        ours, theirs = self.values(name), other.values(name)
-        both = [[ours[run], theirs[run]] for run in sorted(ours.keys() & theirs.keys())]
-        return np.array(both).reshape(-1, 2)
-
-    def contrasts(self, other: Profile) -> dict[str, Contrast]:
-        """The differences on the default, and over the harder levels of each axis, by label."""
-        places = {"the default": [DEFAULT]} | {axis.label: axis.harder for axis in AXES}
-        known = {label: self.against(other, names) for label, names in places.items()}
-        return {label: contrast for label, contrast in known.items() if contrast is not None}
+        return DrawEstimate(value, low, high, count, verdict)
 
     def sentences(self, others: Iterable[Profile] | None = None) -> list[str]:
         """Where it breaks, how fast it learns, and where it is better or worse than PPO, TD3, SAC.
 
         `others` are the profiles it is compared with, by default `references()`.
         """
-        compared = [other for other in self._behind(others) if other.name in _COMPARED]
+        compared = [other for other in self.behind(others) if other.name in COMPARED]
         return [*self._breaks(), self._speed(), *map(self._comparison, compared)]
 
     def _breaks(self) -> list[str]:
@@ -283,7 +267,7 @@ class Profile(StrictModel):
         for verdict in ("better", "worse", "indication"):
             of = {label: each for label, each in contrasts.items() if each.verdict == verdict}
             if of:
-                ordered = sorted(of, key=lambda label: -abs(of[label].difference.value))
+                ordered = sorted(of, key=lambda label: -abs(of[label].value))
                 texts = [f"{label} ({of[label]})" for label in ordered[:3]]
                 more = [f"{len(of) - 3} more"] if len(of) > 3 else []
                 word = "an indication only on" if verdict == "indication" else f"{verdict} on"
@@ -297,22 +281,21 @@ class Profile(StrictModel):
         """The figure of all axes, with the references behind, or with `others`."""
         from sme_registry.profiles.figures import draw_axes
 
-        return draw_axes(self, self._behind(others))
+        return draw_axes(self, self.behind(others))
 
-    def _behind(self, others: Iterable[Profile] | None) -> list[Profile]:
+    def behind(self, others: Iterable[Profile] | None) -> list[Profile]:
         return self.comparable(Profile.references().values() if others is None else others)
 
     def table(self) -> Table:
         """A row for each axis: its levels, N₀ at each, and the robustness."""
         records = []
         for axis in AXES:
-            levels = [self.level(name) for name in axis.levels]
-            regret = (fixed(each.value) if each.draws else "–" for each in levels)
+            regret = (self.level(name)._replace(low=math.nan) for name in axis.levels)
             records.append(
                 {
                     "axis": axis.label,
                     "levels": " → ".join(axis.levels.values()),
-                    "N₀": " → ".join(regret),
+                    "N₀": " → ".join(map(str, regret)),
                     "robustness": str(self.robustness(axis)),
                 }
             )
@@ -358,7 +341,3 @@ def row_of(planned: PlannedCell, result: CellResult) -> ProfileRow:
         evaluations=len(curve.steps),
         steps_to_half=curve.steps[int(reached.argmax())] if reached.any() else None,
     )
-
-
-def failure_of(planned: PlannedCell, failure: CellFailure) -> ProfileFailure:
-    return ProfileFailure(class_name=planned.class_name, run=planned.run, error=failure.error[:500])

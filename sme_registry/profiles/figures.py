@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from sme_registry.plots.style import COLOURS, GREY, MARKERS, draw_band, literal, new_figure, styled
+from sme_registry.plots.style import GREY, draw_band, literal, new_figure, styled
+from sme_registry.profiles.document import COMPARED, Profile
 from sme_registry.profiles.levels import AXES, Axis
 from sme_registry.studies.report.figures.panels import (
     LINEAR,
     WIDTH,
     Look,
     legend,
-    new_look,
+    numbered_looks,
     panel_grid,
     side_by_side,
 )
@@ -22,27 +23,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from sme_registry.profiles.document import Profile
-
-_OTHERS = ("PPO", "TD3", "SAC")  # the order of their colours
 _HIGHEST = 1.45  # N₀ that the figure shows
 _LEAST = -0.6  # robustness
 
 
-def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, dict[str, Any]]:
+def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, Look]:
     """The profile in front; a method of several discounts has one colour. The constant has none."""
-    methods = dict.fromkeys(other.name.partition(" (")[0] for other in others if other.learns)
-    order = [*_OTHERS, *(name for name in methods if name not in _OTHERS)]
-    looks = {profile.name: dict(new_look(COLOURS[0], MARKERS[0]))}
+    methods = [other.name.partition(" (")[0] for other in others if other.learns]
+    numbered = numbered_looks(dict.fromkeys(("", *COMPARED, *methods)), dashes=["-"])
+    looks = {profile.name: numbered[""]}
     for other in others:
         method, _, variant = other.name.partition(" (")
         if other.learns:
-            i = 1 + order.index(method)
-            looks[other.name] = dict(new_look(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]))
-            if variant:
-                looks[other.name] |= {"linestyle": (0, (2, 1.5)), "markerfacecolor": "none"}
+            hollow = {"linestyle": (0, (2, 1.5)), "markerfacecolor": "none"} if variant else {}
+            looks[other.name] = {**numbered[method], **hollow}
         elif other.name == "linear":
-            looks[other.name] = dict(LINEAR)
+            looks[other.name] = LINEAR
     return looks
 
 
@@ -65,15 +61,13 @@ def draw_axes(profile: Profile, others: Sequence[Profile]) -> Figure:
 
 
 def _draw_line(axes: Axes, profile: Profile, axis: Axis, look: Look, *, front: bool) -> None:
-    levels = [(i, profile.level(name)) for i, name in enumerate(axis.levels)]
-    at = [(i, level) for i, level in levels if level.draws]
-    if not at:
+    levels = enumerate(map(profile.level, axis.levels))
+    points = [(i, level.value, level.low, level.high) for i, level in levels if level.draws]
+    if not points:
         return
-    x, y = [i for i, _ in at], [level.value for _, level in at]
-    banded = [(i, level) for i, level in at if not math.isnan(level.low)]
-    if banded and (front or look["marker"]):
-        bands = ([i for i, _ in banded], [e.low for _, e in banded], [e.high for _, e in banded])
-        draw_band(axes, *bands, look["color"])
+    x, y, low, high = zip(*points, strict=True)
+    if front or look["marker"]:
+        draw_band(axes, x, low, high, look["color"])
     width, alpha, order = (2.2, 1.0, 3) if front else (1.1, 0.75, 2)
     axes.plot(x, y, **look, linewidth=width, alpha=alpha, markersize=4, zorder=order)
 

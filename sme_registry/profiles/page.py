@@ -7,28 +7,21 @@ FOLDER/profile.json    the `Profile`
 
 from __future__ import annotations
 
-import base64
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
-from markupsafe import Markup
+import pandas as pd
 
 from sme_registry.io import write_atomically
-from sme_registry.io.markup import environment, fixed
 from sme_registry.plots.style import encoded
-from sme_registry.profiles.document import Profile
+from sme_registry.profiles.document import DrawEstimate, Profile
 from sme_registry.profiles.figures import draw_axes, draw_robustness
 from sme_registry.profiles.levels import AXES
-from sme_registry.studies import report
-
-
-class _Table(NamedTuple):
-    title: str
-    note: str
-    rows: list[dict[str, str]]
+from sme_registry.studies.report.texts import TextTable
+from sme_registry.studies.report.write import listed, rendered
 
 
 def write_page(
@@ -40,86 +33,77 @@ def write_page(
 
     `references` are drawn behind, as far as they are comparable; by default the package's.
     """
-    known = Profile.references().values() if references is None else references
-    others = profile.comparable(known)
+    others, folder = profile.behind(references), Path(folder)
     drawn = {"axes": draw_axes(profile, others), "robustness": draw_robustness(profile, others)}
-    folder = Path(folder)
-    pdf = encoded(drawn["axes"], ["pdf"])["pdf"]
-    svgs = {name: encoded(figure, ["svg"])["svg"] for name, figure in drawn.items()}
+    page = rendered(
+        "profile.html.jinja",
+        Path(__file__).parent / "templates",
+        profile=profile,
+        sentences=profile.sentences(others),
+        figures={name: encoded(figure, ["svg"])["svg"] for name, figure in drawn.items()},
+        tables=[_robustness(profile, others), *_differences(profile, others), _levels(profile)],
+        origin=_origin(profile, others),
+    )
     return [
-        write_atomically(folder / "profile.html", page(profile, others, svgs)),
-        write_atomically(folder / "profile.pdf", pdf),
+        write_atomically(folder / "profile.html", page),
+        write_atomically(folder / "profile.pdf", encoded(drawn["axes"], ["pdf"])["pdf"]),
         profile.write(folder / "profile.json"),
     ]
 
 
-def page(profile: Profile, others: Sequence[Profile], figures: Mapping[str, bytes]) -> str:
-    templates = environment(Path(__file__).parent / "templates", autoescape=True)
-    style = (Path(report.__file__).parent / "page.css").read_text(encoding="utf-8")
-    return templates.get_template("profile.html.jinja").render(
-        profile=profile,
-        sentences=profile.sentences(others),
-        style=Markup(style),
-        figures={name: base64.b64encode(svg).decode() for name, svg in figures.items()},
-        tables=[_robustness(profile, others), *_differences(profile, others), _levels(profile)],
-        origin=[*_origin(profile, others)],
-    )
-
-
-def _robustness(profile: Profile, others: Sequence[Profile]) -> _Table:
+def _robustness(profile: Profile, others: Sequence[Profile]) -> TextTable:
     compared = [profile, *(each for each in others if each.name != "constant")]
     rows = [
         {"axis": axis.label} | {each.name: str(each.robustness(axis)) for each in compared}
         for axis in AXES
     ]
     note = "What is kept of the performance at the harder levels, with 95 % intervals over draws."
-    return _Table("Robustness", note, rows)
+    return TextTable("robustness", "Robustness", note, pd.DataFrame(rows))
 
 
-def _differences(profile: Profile, others: Sequence[Profile]) -> Iterator[_Table]:
-    compared = {other.name: profile.contrasts(other) for other in others if other.learns}
-    labels = dict.fromkeys(label for contrasts in compared.values() for label in contrasts)
-    if not labels:
+def _differences(profile: Profile, others: Sequence[Profile]) -> Iterator[TextTable]:
+    compared = {
+        f"vs. {other.name}": {
+            label: f"{difference} {difference.verdict}"
+            for label, difference in profile.contrasts(other).items()
+        }
+        for other in others
+        if other.learns
+    }
+    if not any(compared.values()):
         return
-    rows = []
-    for label in labels:
-        row = {"axis": label}
-        for name, contrasts in compared.items():
-            each = contrasts.get(label)
-            row[f"vs. {name}"] = "–" if each is None else f"{each} {each.verdict}"
-        rows.append(row)
+    frame = pd.DataFrame(compared).fillna("–").rename_axis("axis").reset_index()
     note = (
         f"N₀ of {profile.name} minus that of the other, over the harder levels of each axis: below "
         "0 it is better. In pairs, on the same draw with the same seed; IQM over pairs, mean over "
         "levels, with 95 % intervals. Open: the interval includes 0."
     )
-    yield _Table(f"Difference of {profile.name} from the references", note, rows)
+    title = f"Difference of {profile.name} from the references"
+    yield TextTable("differences", title, note, frame)
 
 
-def _levels(profile: Profile) -> _Table:
-    failed = dict.fromkeys(profile.classes, 0)
-    for failure in profile.failures:
-        failed[failure.class_name] += 1
+def _levels(profile: Profile) -> TextTable:
+    failed = Counter(failure.class_name for failure in profile.failures)
     rows = []
-    for name in dict.fromkeys((*profile.classes, *_every_level())):
-        done, count = profile.level(name), failed.get(name, 0)
-        row = {"level": name, "N₀": str(done)}
-        row["N̄ outside"] = str(profile.level(name, "ood_regret"))
-        row["decay"] = _percent(profile.level(name, "ood_decay").value)
-        row["online regret"] = _number(profile.level(name, "online_regret").value)
-        row["steps to N₀ ≤ ½"] = _steps(profile, name)
-        row["draws"] = f"{done.draws}" + (f", {count} failed" if count else "")
-        rows.append(row)
+    for name in dict.fromkeys(level for axis in AXES for level in axis.levels):
+        regret = profile.level(name)
+        rows.append(
+            {
+                "level": name,
+                "N₀": str(regret),
+                "N̄ outside": str(profile.level(name, "ood_regret")),
+                "decay": _number(profile.level(name, "ood_decay"), ".1%"),
+                "online regret": _number(profile.level(name, "online_regret"), ".3f"),
+                "steps to N₀ ≤ ½": _steps(profile, name),
+                "draws": f"{regret.draws}" + (f", {failed[name]} failed" if failed[name] else ""),
+            }
+        )
     note = (
         "N₀ within the training cube, N̄ its mean over the shells around it, decay the share of "
         "similarity that is lost there, online regret the mean of 1 − reward over all steps of "
         "training. IQM over draws, of steps the median; “never” within these steps."
     )
-    return _Table("Every level", note, rows)
-
-
-def _every_level() -> list[str]:
-    return [name for axis in AXES for name in axis.levels]
+    return TextTable("levels", "Every level", note, pd.DataFrame(rows))
 
 
 def _steps(profile: Profile, name: str) -> str:
@@ -127,19 +111,15 @@ def _steps(profile: Profile, name: str) -> str:
     return "–" if steps is None else "never" if math.isinf(steps) else f"{steps:,.0f}"
 
 
-def _number(value: float) -> str:
-    return "–" if math.isnan(value) else fixed(value, 3)
-
-
-def _percent(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.1%}"
+def _number(estimate: DrawEstimate, form: str) -> str:
+    return format(estimate.value, form) if estimate.draws else "–"
 
 
 def _origin(profile: Profile, others: Sequence[Profile]) -> Iterator[tuple[str, str, str]]:
     """A name, a digest or other code, and a text."""
     algorithm = profile.algorithm
-    settings = ", ".join(f"{k} = {v}" for k, v in sorted(algorithm.hyperparameters.items()))
-    yield "algorithm", algorithm.uses, settings or "default hyperparameters"
+    settings = listed(algorithm.hyperparameters, " = ") or "default hyperparameters"
+    yield "algorithm", algorithm.uses, settings
     if algorithm.source:
         yield "source", algorithm.source, "of its module"
     done, failed = len(profile.rows), len(profile.failures)
@@ -150,11 +130,7 @@ def _origin(profile: Profile, others: Sequence[Profile]) -> Iterator[tuple[str, 
     yield "draws", "", f"{profile.seeds} of each level, the seed of training is their number"
     yield "plan", profile.plan_digest, profile.plan
     yield "protocol", profile.protocol_digest, "of N₀ and N̄"
-    yield "versions", "", _versions(profile)
+    yield "versions", "", listed(profile.versions)
     for other in others:
         uses = other.algorithm.uses
-        yield f"reference {other.name}", uses, f"{len(other.rows)} runs; {_versions(other)}"
-
-
-def _versions(profile: Profile) -> str:
-    return ", ".join(f"{name} {version}" for name, version in sorted(profile.versions.items()))
+        yield f"reference {other.name}", uses, f"{len(other.rows)} runs; {listed(other.versions)}"

@@ -13,14 +13,13 @@ from typing import Any
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import check_writable, require_packages
 from sme_registry.io.system import module_file
-from sme_registry.profiles.document import Profile, failure_of, row_of
+from sme_registry.profiles.document import Profile, ProfileFailure, row_of
 from sme_registry.profiles.levels import AXES, DEFAULT, plan_file
 from sme_registry.profiles.page import write_page
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
-from sme_registry.spec.study import Cell, PlannedCell
+from sme_registry.spec.study import Cell
 from sme_registry.studies.budget import scaled
 from sme_registry.studies.ledger import Ledger
-from sme_registry.studies.result import CellFailure, CellResult
 from sme_registry.studies.runner import run_study
 from sme_registry.training import algorithms, functions
 
@@ -183,7 +182,7 @@ def profile_of(
     A run counts if it is on the task of a level, with its seed, and its protocol and steps are
     those of the other runs that count; its evaluations may be more or fewer.
     """
-    ledger = Ledger(folder)
+    ledger, released = Ledger(folder), plan_file()
     plan = ledger.study_file().plan
     chosen = _chosen(plan, algorithm, folder)
     file = study_of(chosen, steps=chosen.steps or plan.steps or None, seeds=plan.seeds)
@@ -192,8 +191,33 @@ def profile_of(
     keys = {_task(cell): cell.digest for cell in of_study if cell.stream is None}
     wanted = [each for each in file.plan.cells if each.class_name in names]
     places = {key: each for each in wanted if (key := keys.get(_task(each.cell)))}
-    results, failures = ledger.results(places), ledger.failures(places)
-    return _profile(file, names, places, results, failures, folder)
+    results = ledger.results(places)
+    failures = ledger.failures(key for key in places if key not in results)
+    rows = tuple(row_of(places[key], result) for key, result in results.items())
+    if not any(row.class_name == DEFAULT for row in rows):
+        errors = [f"The first failure: {failure.error}" for failure in failures.values()]
+        raise OptionError(
+            f"folder={str(folder)!r}: has no finished run on the default, from which robustness is "
+            f"computed, with the profile's draws, {file.plan.steps:,} steps and its protocol. "
+            f"{errors[0] if errors else 'Run that class of the plan profile-v1, too.'}"
+        )
+    return Profile(
+        algorithm=chosen,
+        plan=released.versioned_name,
+        plan_digest=released.digest,
+        protocol_digest=released.plan.protocol.digest,
+        steps=file.plan.steps,
+        seeds=file.plan.seeds,
+        classes=names,
+        rows=rows,
+        failures=tuple(
+            ProfileFailure(
+                class_name=places[key].class_name, run=places[key].run, error=failure.error[:500]
+            )
+            for key, failure in failures.items()
+        ),
+        versions={k: v for result in results.values() for k, v in result.versions.items()},
+    )
 
 
 def _task(cell: Cell) -> tuple[str, int, int, str]:
@@ -211,42 +235,3 @@ def _chosen(plan: StudyPlan, name: str | None, folder: Any) -> StudyAlgorithm:
             f"{', '.join(known)}.{near}"
         )
     return known[name]
-
-
-def _profile(
-    file: StudyFile,
-    classes: tuple[str, ...],
-    places: Mapping[str, PlannedCell],
-    results: Mapping[str, CellResult],
-    failures: Mapping[str, CellFailure],
-    folder: Any,
-) -> Profile:
-    rows = tuple(row_of(places[key], result) for key, result in results.items())
-    failed = tuple(failure_of(places[k], f) for k, f in failures.items() if k not in results)
-    if not rows:
-        reason = f"The first failure: {failed[0].error}" if failed else "None has been run."
-        raise OptionError(
-            f"folder={str(folder)!r}: has no finished run on a level of the profile, with its "
-            f"draws, {file.plan.steps:,} steps and its protocol. {reason}"
-        )
-    if not any(row.class_name == DEFAULT for row in rows):
-        raise OptionError(
-            f"folder={str(folder)!r}: has no finished run on the default, from which robustness is "
-            "computed. Run that class of the plan profile-v1, too."
-        )
-    versions: dict[str, str] = {}
-    for result in results.values():
-        versions |= result.versions
-    plan = plan_file()
-    return Profile(
-        algorithm=file.plan.algorithms[0],
-        plan=plan.versioned_name,
-        plan_digest=plan.digest,
-        protocol_digest=plan.plan.protocol.digest,
-        steps=file.plan.steps,
-        seeds=file.plan.seeds,
-        classes=classes,
-        rows=rows,
-        failures=failed,
-        versions=versions,
-    )

@@ -141,8 +141,8 @@ class TestFacts:
         contrasts = better.contrasts(theirs)
         assert {contrast.verdict for contrast in contrasts.values()} == {"better"}
         k = contrasts[AXIS["k"].label]
-        assert k.difference.value == pytest.approx(-0.2)
-        assert k.difference.draws == 10  # pairs, of two levels
+        assert k.value == pytest.approx(-0.2)
+        assert k.draws == 10  # pairs, of two levels
         few = made(lambda level, i: 0.3 + 0.05 * i, draws=3).contrasts(theirs)
         assert {contrast.verdict for contrast in few.values()} == {"indication"}
         noise = made(lambda level, i: 0.6 + (-1) ** i * 0.2)

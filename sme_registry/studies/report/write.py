@@ -23,7 +23,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 from markupsafe import Markup
@@ -211,9 +211,6 @@ def page(
     explorers: Sequence[Explorer] = (),
 ) -> str:
     """The whole page; `absent` has a sentence for each figure that could not be drawn."""
-    folder = Path(__file__).parent
-    templates = environment(folder / "templates", autoescape=True)
-    templates.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
     by_section = {
         key: [figure for figure in figures if figure.name.startswith(prefixes)]
         for key, (_, prefixes) in _SECTIONS.items()
@@ -223,10 +220,10 @@ def page(
         "offline": "offline" in set(rows.section), "absent": absent, "explorers": explorers,
     }  # fmt: skip
     offline = [table for table in tables if table.name.startswith("offline")]
-    return templates.get_template("page.html.jinja").render(
+    return rendered(
+        "page.html.jinja",
         analysis=analysis,
         kinds=_kinds(analysis),
-        style=Markup((folder / "page.css").read_text(encoding="utf-8")),
         sections={
             key: heading
             for key, (heading, _) in _SECTIONS.items()
@@ -241,6 +238,15 @@ def page(
         missing=_missing(analysis),
         max_missing=_MAX_MISSING,
     )
+
+
+def rendered(template: str, *folders: Path, **values: Any) -> str:
+    """A page in the style of reports, by a template of theirs or of other folders."""
+    here = Path(__file__).parent
+    templates = environment(*folders, here / "templates", autoescape=True)
+    templates.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
+    style = Markup((here / "page.css").read_text(encoding="utf-8"))
+    return templates.get_template(template).render(style=style, **values)
 
 
 def _by_subject(rows: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
@@ -276,21 +282,23 @@ def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
     yield "evaluations", "", f"{plan.evaluations:,} during training, {episodes} each"
     for algorithm in plan.algorithms:
         steps = plan.steps if algorithm.steps is None else algorithm.steps
-        settings = ", ".join(f"{k} = {v}" for k, v in sorted(algorithm.hyperparameters.items()))
+        settings = listed(algorithm.hyperparameters, " = ") or "default hyperparameters"
         budget = f"{steps:,} steps, " if plan.classes else ""
         text = f"{budget}{algorithm.action_range} actions"
-        yield algorithm.name, algorithm.uses, f"{text}, {settings or 'default hyperparameters'}"
+        yield algorithm.name, algorithm.uses, f"{text}, {settings}"
     programs = (result.program for result in analysis.cells.values())
     kinds = Counter((p.device, p.lanes) for p in programs if p is not None)
     for (device, lanes), count in kinds.most_common():
         text = f"on {device}, in programs of {plural(lanes, 'lane')}"
         yield f"{plural(count, 'run')} in JAX", "", text
-    versions = Counter(
-        ", ".join(f"{name} {version}" for name, version in sorted(result.versions.items()))
-        for result in analysis.cells.values()
-    )
+    versions = Counter(listed(result.versions) for result in analysis.cells.values())
     for text, count in versions.most_common():
         yield f"versions of {plural(count, 'run')}", "", text
+
+
+def listed(values: Mapping[str, Any], between: str = " ") -> str:
+    """`numpy 2.1, torch 2.5`."""
+    return ", ".join(f"{name}{between}{value}" for name, value in sorted(values.items()))
 
 
 def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) -> list[Explorer]:
