@@ -36,7 +36,7 @@ from sme_registry.studies.ledger import (
     State,
     StudyStatus,
     label,
-    study_status,
+    plan_status,
 )
 from sme_registry.studies.runner import run_study
 
@@ -158,7 +158,8 @@ def status(
       sme study status runs/smoke
       sme study status runs/all --only "class=k-*" --json
     """
-    print_status(study_status(folder, only or (), options.scaled), json)
+    ledger = Ledger(folder)
+    print_status(plan_status(ledger, options.scaled(ledger.study_file()), only or ()), json)
 
 
 def report(

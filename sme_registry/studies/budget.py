@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import statistics
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from operator import attrgetter
 
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
@@ -35,10 +36,7 @@ SECONDS_PER_STEP = {
 _OTHER = 0.012  # of an algorithm that is not in the table
 _START = 2.0  # a process, its imports and the evaluations
 _LONGEST_NAME = 64
-_KINDS: dict[str, Callable[[PlannedCell], str]] = {
-    "class": lambda planned: planned.class_name,
-    "algorithm": lambda planned: planned.algorithm,
-}
+_KINDS = {"class": attrgetter("class_name"), "algorithm": attrgetter("algorithm")}
 
 
 class Estimator:
@@ -147,7 +145,7 @@ def _renamed(file: StudyFile, plan: StudyPlan, suffix: str) -> StudyFile:
 def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[PlannedCell, ...]:
     """The cells that match."""
     cells = tuple(cells)
-    matching: dict[str, set[str]] = {}  # the names that the patterns of each kind match
+    matching = defaultdict[str, set[str]](set)  # the names that the patterns of each kind match
     for text in only:
         kind, equals, glob = text.partition("=")
         if not equals or kind not in _KINDS:
@@ -162,7 +160,7 @@ def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[Pl
                 f"only={text!r}: matches no {kind} of the plan.{did_you_mean(glob, names)} "
                 f"Available: {listed}."
             )
-        matching.setdefault(kind, set()).update(matches)
+        matching[kind].update(matches)
     return tuple(
         cell
         for cell in cells

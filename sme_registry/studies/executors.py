@@ -3,8 +3,7 @@
 Every executor is one `map`: it takes the next job when a worker is free, a cell or the cells of one
 program, and yields the outcomes in the order in which cells end. Its caller writes them: only the
 driver touches the study's folder, except for the states of programs, which may be gigabytes.
-A new executor is a class here and a row of `EXECUTORS`; one with an address is an argument of
-`run_study` and an option of `sme study run`, too.
+A new executor is a class here and a row of `EXECUTORS`.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import time
 import traceback
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from multiprocessing import connection
@@ -71,7 +70,6 @@ class Executor(ABC):
     """
 
     local: ClassVar[bool] = True  # whether jobs have the files and devices of this machine
-    default_address: ClassVar[str | None] = None  # None of those that run nowhere else
 
     def __init__(
         self,
@@ -81,7 +79,7 @@ class Executor(ABC):
         address: str | None = None,
     ) -> None:
         self._jobs, self._run, self._keep_models = jobs, run, keep_models
-        self._address = address or self.default_address
+        self._address = address
         self._running: dict[Any, Any] = {}
 
     @property
@@ -284,10 +282,10 @@ class OnRay(Executor):
     """A task on one core of a Ray cluster for each job; one whose node is lost runs again."""
 
     local = False
-    default_address = "local"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        self._address = self._address or "local"
         self._ray = _import_ray()
         self._connected_here = False  # then `map` disconnects
         if self._address != "local":  # now, so that a wrong one is refused before anything runs
@@ -387,14 +385,10 @@ EXECUTORS: dict[str, type[Executor]] = {
 """The executors by name, as `run_study` and `sme study run` take it."""
 
 
-def executor_type(name: str | None, addresses: Mapping[str, str | None]) -> type[Executor]:
-    """The executor of a name, or the one whose address is given; by default the first."""
-    given = [each for each, address in addresses.items() if address is not None]
-    name = name or next(iter(given), next(iter(EXECUTORS)))
+def executor_type(name: str | None, ray: str | None) -> type[Executor]:
+    """The executor of a name; by default Ray where its address is given, else processes."""
+    name = name or ("processes" if ray is None else "ray")
     choice("executor", name, EXECUTORS, error=UnknownNameError)
-    for other in given:
-        if other != name:
-            raise OptionError(
-                f"{other}={addresses[other]!r}: contradicts executor={name!r}. Leave one out."
-            )
+    if ray is not None and name != "ray":
+        raise OptionError(f"ray={ray!r}: contradicts executor={name!r}. Leave one out.")
     return EXECUTORS[name]

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -48,13 +48,6 @@ PLAN = "plan.json"
 CELLS, FAILED, LOCKS, REPORT = "cells", "failed", "locks", "report"
 STATE_FILES = "states"  # of programs that run, or were killed
 _STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS_OF_STUDY, REPORT, STATE_FILES}
-
-
-class SavedState(NamedTuple):
-    """The state of a program in a file, and the keys of the cells that are its runs."""
-
-    path: Path
-    keys: list[str]
 
 
 _Entry = TypeVar("_Entry", CellResult, CellFailure)
@@ -166,13 +159,13 @@ class Ledger:
         name = hashlib.sha256(identity.encode()).hexdigest()[:16]
         return self.folder / STATE_FILES / f"{name}.npz"
 
-    def state_of(self, key: str, build_key: Mapping[str, Any]) -> SavedState | None:
-        """A saved state, made with the same, of a program that runs this cell."""
+    def state_of(self, key: str, build_key: Mapping[str, Any]) -> tuple[Path, list[str]] | None:
+        """A saved state, made with the same, of a program that runs this cell; and its cells."""
         for path in self._states():
             header = read_header(path)
-            keys = header.get("cells", [])
+            keys: list[str] = header.get("cells", [])
             if key in keys and build_key.items() <= header.items():
-                return SavedState(path, list(keys))
+                return path, keys
         return None
 
     def remove_states(self, ended: Path) -> None:
@@ -358,18 +351,13 @@ def requested(ledger: Ledger, file: StudyFile) -> set[str]:
     return {key for keys in groups.values() if keys & ended for key in keys}
 
 
-def study_status(
-    folder: str | os.PathLike[str],
-    only: Sequence[str] = (),
-    scale: Callable[[StudyFile], StudyFile] = lambda file: file,
-) -> StudyStatus:
+def study_status(folder: str | os.PathLike[str], only: Sequence[str] = ()) -> StudyStatus:
     """The state of the study in a folder. Changes nothing, and may be called while it runs.
 
     `only` has patterns `class=GLOB`, `algorithm=GLOB`; it is empty for every cell of the plan.
-    `scale` is applied to the folder's plan first.
     """
     ledger = Ledger(folder)
-    return plan_status(ledger, scale(ledger.study_file()), only)
+    return plan_status(ledger, ledger.study_file(), only)
 
 
 def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str]) -> StudyStatus:

@@ -33,7 +33,7 @@ from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.jax import find_device
-from sme_registry.jax.program import Evaluation, Program, StepLog
+from sme_registry.jax.program import Evaluation, StepLog
 from sme_registry.jax.run import hidden_of, new_program, policy_of
 from sme_registry.jax.run import run as run_to_end
 from sme_registry.jax.task import Form
@@ -55,7 +55,6 @@ from sme_registry.training.algorithms import backend_of, imported
 from sme_registry.training.record import Snapshots, versions_for
 
 _Report = EvaluationReport | StreamReport
-_Shape = tuple[int, int, int, int]
 SECONDS_BETWEEN_STATES = 180.0
 _MOST_RUNS = 10  # on a CPU: more save little time, and the last of a study would run alone longer
 _MOST_RUNS_ELSEWHERE = 256
@@ -104,8 +103,9 @@ class Programs:
 
     def cells(self, keys: Iterable[str]) -> tuple[Cell, ...] | None:
         """The cells of the plan with these keys; None if one of them is not in it any longer."""
-        known = [self._cells.get(key) for key in keys]
-        return tuple(cell for cell in known if cell is not None) if None not in known else None
+        with contextlib.suppress(KeyError):
+            return tuple(self._cells[key] for key in keys)
+        return None
 
     def group(self, cell: Cell) -> Hashable:
         """What the cells of a program have in common."""
@@ -118,35 +118,17 @@ class Programs:
             cell.evaluation_episodes,
             # Rewards that change no observation and end no episode are computed in another way.
             all(spec.separable for spec in cell.specs),
-            _forms(cell),
+            tuple(map(Form.of, cell.specs)),
             cell.document.switches,
         )
 
 
-def _forms(cell: Cell) -> tuple[Any, ...]:
-    return tuple(map(Form.of, cell.specs))
-
-
-def shape_of(cell: Cell) -> _Shape:
+def shape_of(cell: Cell) -> tuple[int, int, int, int]:
     """S, A, L and H of a cell's task; of a stream the greatest."""
-    shapes = [(f.state_dim, f.action_dim, f.complexity, f.hidden_width) for f in _forms(cell)]
+    forms = map(Form.of, cell.specs)
+    shapes = [(f.state_dim, f.action_dim, f.complexity, f.hidden_width) for f in forms]
     S, A, L, H = map(max, zip(*shapes, strict=True))
     return S, A, L, H
-
-
-def _new_program(cells: Sequence[Cell], shared: SharedProgram) -> Program:
-    """The program of cells of one group."""
-    cell = cells[0]
-    return new_program(
-        cell.uses,
-        [each.document for each in cells],
-        [each.seed for each in cells],
-        hyperparameters=cell.hyperparameters,
-        action_range=cell.action_range,
-        steps=cell.steps,
-        runs=shared.runs,
-        device=shared.device,
-    )
 
 
 def platform_of(device: str | None) -> str:
@@ -184,7 +166,16 @@ class _ProgramRun:
         self._of_job = {cell.digest for cell in cells}
         self._cells = shared.cells or tuple(cells)
         self._cell = cells[0]
-        self._program = _new_program(self._cells, shared)
+        self._program = new_program(
+            self._cell.uses,
+            [cell.document for cell in self._cells],
+            [cell.seed for cell in self._cells],
+            hyperparameters=self._cell.hyperparameters,
+            action_range=self._cell.action_range,
+            steps=self._cell.steps,
+            runs=shared.runs,
+            device=shared.device,
+        )
         self._result = ProgramResult(
             device=str(self._program.device.device_kind),
             lanes=shared.runs,
@@ -213,7 +204,11 @@ class _ProgramRun:
         for run, cell in enumerate(self._cells):
             step = int(self._record.arrays["failed_at"][run])
             if cell.digest in self._of_job and step >= 0:
-                yield failed(cell, _not_finite(step))
+                error = PolicyError(
+                    f"its weights were not finite after step {step:,}. Choose a lower "
+                    "learning_rate, or look at the other runs of this algorithm."
+                )
+                yield failed(cell, error)
             elif cell.digest in self._of_job:
                 groups[cell.digest if cell.stream else cell.protocol.digest].append(run)
         for runs in groups.values():
@@ -378,10 +373,3 @@ def _new_model(cell: Cell) -> Any:
 def _policy(cell: Cell, weights: Arrays) -> Any:
     settings, range_ = cell.hyperparameters, cell.action_range
     return policy_of(cell.uses, weights, hyperparameters=settings, action_range=range_)
-
-
-def _not_finite(step: int) -> PolicyError:
-    return PolicyError(
-        f"its weights were not finite after step {step:,}. Choose a lower learning_rate, or look "
-        "at the other runs of this algorithm."
-    )

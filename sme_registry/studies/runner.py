@@ -86,7 +86,7 @@ def run_study(
     checked = planned.values() if run is run_cell else ()
     _check(plan_file.plan, checked, console if progress else None)
     if not isinstance(executor, Executor):
-        executor = executor_type(executor, {"ray": ray})(jobs, run, keep_models, ray)
+        executor = executor_type(executor, ray)(jobs, run, keep_models, ray)
     programs = _programs(plan_file.plan, checked, device, lanes, local=executor.local)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
@@ -238,14 +238,14 @@ class Queue:
         with claiming, contextlib.ExitStack() as stack:  # releases all of them if one raises
             cells, locks = list[Cell](), list[Lock]()
             program = programs.program(self.planned[first].cell)
-            saved = self._ledger.state_of(first, program.build_key)
-            in_state = programs.cells(saved.keys) if saved else None
+            path, keys = self._ledger.state_of(first, program.build_key) or (None, [])
+            in_state = programs.cells(keys)
             if in_state is None:
-                saved, in_state = None, ()
+                path, in_state = None, ()
             group = programs.group(self.planned[first].cell)
             candidates = [
                 key
-                for key in (self.waiting if saved is None else saved.keys)
+                for key in (keys if path else self.waiting)
                 if key in self.waiting and programs.group(self.planned[key].cell) == group
             ]
             for key in sorted(candidates, key=lambda key: key != first):  # which leads
@@ -254,8 +254,9 @@ class Queue:
                     cells.append(self.planned[key].cell)
                 if not cells:
                     return None
-            new = self._ledger.state_path([cell.digest for cell in cells], program.build_key)
-            program = replace(program, state=saved.path if saved else new, cells=in_state)
+            if path is None:
+                path = self._ledger.state_path([cell.digest for cell in cells], program.build_key)
+            program = replace(program, state=path, cells=in_state)
             stack.pop_all()
         return self._started(Job(tuple(cells), program), locks)
 
