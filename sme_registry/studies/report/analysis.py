@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,7 +36,6 @@ from sme_registry.evaluation import retention
 from sme_registry.evaluation.dynamic_regret import DynamicRegret, reference_regret
 from sme_registry.evaluation.streams import StreamReport
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.spec.study import PlannedCell
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.report.design import (
     WITHIN,
@@ -46,7 +45,7 @@ from sme_registry.studies.report.design import (
     StreamInfo,
     metrics_of,
 )
-from sme_registry.studies.report.frames import FinishedLife, frame, ordered
+from sme_registry.studies.report.frames import FinishedLife, frame
 from sme_registry.studies.result import CellResult
 
 # With fewer runs an interval is an indication only: docs/results/interval_coverage.py measures how
@@ -100,16 +99,17 @@ class RunKind(NamedTuple):
 class Analysis:
     """A study's finished runs, lives and tables, which the module `tables` documents.
 
-    `cells`, `errors` and `models` are by the digests of cells, `classes` and `streams` by name, the
-    first one first. `algorithms` have a finished run on a single task; `learners` are those of them
-    that learn; `coloured` are all that learn, so that a method has one colour in every figure of a
-    study. `reference_costs` are by class of streams and reference, one for each draw.
+    `cells` and `models` are by the digests of cells, `classes` and `streams` by name, the first one
+    first. `places` has a row for each planned cell; its state is `finished`, `failed`, `missing`,
+    or `left out` by `--only`. `algorithms` have a finished run on a single task; `learners` are
+    those of them that learn; `coloured` are all that learn, so that a method has one colour in
+    every figure of a study. `reference_costs` are by class of streams and reference, one for each
+    draw.
     """
 
     file: StudyFile
     cells: Mapping[str, CellResult]
-    errors: Mapping[str, str]
-    requested_cells: Collection[str] | None
+    places: pd.DataFrame
     models: Mapping[str, Path]
     bootstrap: Bootstrap
     classes: Mapping[str, ClassInfo]
@@ -151,38 +151,33 @@ class Analysis:
         metrics = metrics_of("life")
         return tasks, RunKind(True, lives, axes, self.stream_algorithms, metrics, "stream_digest")
 
-    def state(self, key: str) -> str:
-        """Of a cell by its digest: `finished`, `failed`, `missing`, or `left out` by `--only`."""
-        if key in self.cells:
-            return "finished"
-        if key in self.errors:
-            return "failed"
-        requested = self.requested_cells is None or key in self.requested_cells
-        return "missing" if requested else "left out"
-
-    def missing(self, *, streams: bool) -> list[PlannedCell]:
+    def missing(self, *, streams: bool) -> pd.DataFrame:
         """The requested cells that have not finished."""
-        cells = [cell for cell in self.plan.cells if cell.in_stream == streams]
-        return [c for c in cells if self.state(c.cell.digest) in ("missing", "failed")]
+        places = self.places
+        return places[(places.streams == streams) & places.state.isin(["missing", "failed"])]
 
     def counts(self, *, streams: bool) -> Counter[str]:
         """How many runs are in each state; of streams those that differ: lives share others."""
-        keys = [cell.cell.digest for cell in self.plan.cells if cell.in_stream == streams]
-        return Counter(self.state(key) for key in (dict.fromkeys(keys) if streams else keys))
+        places = self.places[self.places.streams == streams]
+        return Counter((places.drop_duplicates("key") if streams else places).state)
+
+    @property
+    def _counts(self) -> Counter[str]:
+        return self.counts(streams=False) + self.counts(streams=True)
 
     @property
     def planned(self) -> int:
         """How many runs the plan has, lives and fresh agents included."""
-        return (self.counts(streams=False) + self.counts(streams=True)).total()
+        return self._counts.total()
 
     @property
     def finished(self) -> int:
-        return sum(self.counts(streams=streams)["finished"] for streams in (False, True))
+        return self._counts["finished"]
 
     @property
     def requested(self) -> int:
         """How many runs have finished or are missing; `--only` may have left out others."""
-        return self.planned - sum(self.counts(streams=s)["left out"] for s in (False, True))
+        return self.planned - self._counts["left out"]
 
     @property
     def seconds(self) -> float:
@@ -282,6 +277,12 @@ def training_data(runs: pd.DataFrame) -> dict[str, tuple[float, int] | None]:
     }
 
 
+def counted(places: pd.DataFrame, **properties: pd.Series) -> pd.DataFrame:
+    """How many planned cells have each property, by class and algorithm."""
+    counts = places[PLACE].assign(**properties).groupby(PLACE, sort=False).sum()
+    return counts.astype("int64").reset_index()
+
+
 _AT = "region:str visit:int64 phase:int64 metric:str"
 _POINTS = 201  # of a curve of regret
 _EPISODES = 1000  # in which the reference agents act, over all draws of a stream
@@ -291,22 +292,18 @@ Costs = Mapping[tuple[str, str], Sequence[DynamicRegret]]
 """(class, reference) → the expected dynamic regret of a reference agent in each draw."""
 
 
-@table(
-    "stream_counts",
-    f"{PLACE_COLUMNS} lives:int64 fresh_agents:int64 planned_lives:int64 "
-    "planned_fresh_agents:int64 failed:int64",
-)
-def _counts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    states: dict[tuple[str, str], list[tuple[bool, str]]] = defaultdict(list)
-    for planned in ordered(analysis.plan):
-        if planned.in_stream:
-            state = planned.phase is not None, analysis.state(planned.cell.digest)
-            states[planned.class_name, planned.algorithm].append(state)
-    for at, of_place in states.items():
-        finished = (of_place.count((fresh, "finished")) for fresh in (False, True))
-        fresh = sum(fresh for fresh, _ in of_place)
-        failed = sum(state == "failed" for _, state in of_place)
-        yield (*at, *finished, len(of_place) - fresh, fresh, failed)
+@table("stream_counts", "")
+def _counts(analysis: Analysis) -> pd.DataFrame:
+    places = analysis.places[analysis.places.streams]
+    fresh, finished = places.phase.notna(), places.state == "finished"
+    return counted(
+        places,
+        lives=finished & ~fresh,
+        fresh_agents=finished & fresh,
+        planned_lives=~fresh,
+        planned_fresh_agents=fresh,
+        failed=places.state == "failed",
+    )
 
 
 @table("stream_metrics", f"{PLACE_COLUMNS} region:str metric:str {INTERVAL}")
@@ -350,11 +347,6 @@ def _references(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
         yield (*place, WITHIN, "online_regret", regret)
 
 
-@table("stream_regret", "")
-def _regret(analysis: Analysis) -> pd.DataFrame:
-    return regret(analysis.lives)
-
-
 @table("stream_reference_regret", "class_name:str reference:str lifetime median")
 def _reference_regret(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     """The dynamic regret of reference agents until points of the life, if there is any."""
@@ -393,12 +385,13 @@ def reference_costs(lives: Sequence[FinishedLife]) -> Costs:
     return costs
 
 
-def regret(lives: Sequence[FinishedLife]) -> pd.DataFrame:
+@table("stream_regret", "")
+def regret(analysis: Analysis) -> pd.DataFrame:
     """The dynamic regret until points of the life, next to that of fresh agents."""
     columns = f"{PLACE_COLUMNS} lifetime median q25 q75 fresh frozen runs:int64"
     tables = [frame([], columns)]
     groups: dict[tuple[str, str], list[StreamReport]] = defaultdict(list)
-    for life in lives:
+    for life in analysis.lives:
         if life.report.dynamic_regret is not None:
             groups[life.planned.class_name, life.planned.algorithm].append(life.report)
     for (name, algorithm), reports in groups.items():

@@ -45,7 +45,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,8 +53,9 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.spec import StudyAlgorithm, StudyFile
+from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.statistics import Array, Statistic
+from sme_registry.studies.ledger import label
 from sme_registry.studies.report.analysis import (
     CURVES,
     ENOUGH_RUNS,
@@ -68,6 +68,7 @@ from sme_registry.studies.report.analysis import (
     RunKind,
     by_place,
     change_verdict,
+    counted,
     reference_costs,
     summary,
     table,
@@ -85,6 +86,7 @@ from sme_registry.studies.report.design import (
 )
 from sme_registry.studies.report.frames import (
     RUN,
+    RUN_COLUMNS,
     finished_lives,
     frame,
     ordered,
@@ -115,16 +117,16 @@ def analyse(
     finished: Mapping[str, CellResult],
     errors: Mapping[str, str] | None = None,
     *,
-    requested: Collection[str] | None = None,
+    requested: Collection[str] = (),
     models: Mapping[str, Path] | None = None,
     coloured: Sequence[StudyAlgorithm] = (),
     draws: int = statistics.DRAWS,
 ) -> Analysis:
     """Every table of a study; equal for equal results.
 
-    Results, errors and models are by the digests of their cells, of which those that are
-    `requested`, None for all, count as missing without a result. Colours go to the algorithms that
-    are `coloured`, by default the plan's, in order.
+    Results, errors and models are by the digests of their cells. Of those `requested`, by default
+    all, runs without a result are missing. Colours go to the algorithms that are `coloured`, by
+    default the plan's, in order.
     """
     plan = file.plan
     results, curves = study_frames(plan, finished)
@@ -138,8 +140,7 @@ def analyse(
     analysis = Analysis(
         file=file,
         cells={key: finished[key] for key in (*runs.key, *keys)},
-        errors=errors or {},
-        requested_cells=requested,
+        places=_places(plan, finished, errors or {}, requested),
         models=models or {},
         bootstrap=Bootstrap(file.digest, draws),
         classes=classes,
@@ -158,19 +159,28 @@ def analyse(
     return with_tables(analysis)
 
 
+def _places(
+    plan: StudyPlan,
+    finished: Collection[str],
+    errors: Mapping[str, str],
+    requested: Collection[str],
+) -> pd.DataFrame:
+    """Every planned cell, in the order of the plan."""
+    rows = [(*place(c).values(), c.phase, c.in_stream, label(c), c.cell.digest) for c in plan.cells]
+    places = frame(rows, RUN_COLUMNS + "phase:Int64 streams:bool label:str key:str")
+    known = [places.key.isin([*keys]) for keys in (finished, errors, requested or places.key)]
+    states = np.select(known, ["finished", "failed", "missing"], "left out")
+    return places.assign(state=states, error=[errors.get(key, "") for key in places.key])
+
+
 def _learners(algorithms: Sequence[StudyAlgorithm]) -> tuple[str, ...]:
     return tuple(a.name for a in algorithms if parse_uses(a.uses)[0] != "reference")
 
 
 @table("missing", "", both=True)
 def _missing(analysis: Analysis, part: RunKind) -> pd.DataFrame:
-    rows = [
-        (*place(c).values(), c.phase, analysis.errors.get(c.cell.digest, ""), c.cell.digest)
-        for c in analysis.missing(streams=part.streams)
-    ]
-    columns = f"{PLACE_COLUMNS} run:int64 phase:Int64 error:str key:str"
-    missing = frame(rows, columns)
-    return missing if part.streams else missing.drop(columns=["phase", "key"])
+    columns = [*RUN, "phase", "error", "key"] if part.streams else [*RUN, "error"]
+    return analysis.missing(streams=part.streams)[columns].reset_index(drop=True)
 
 
 @table(
@@ -274,15 +284,12 @@ def _learning_curves(analysis: Analysis, part: RunKind) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-@table("counts", f"{PLACE_COLUMNS} done:int64 failed:int64 planned:int64")
-def _counts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    states: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for planned in ordered(analysis.plan):
-        state = analysis.state(planned.cell.digest)
-        if not planned.in_stream and state != "left out":
-            states[planned.class_name, planned.algorithm].append(state)
-    for at, of_place in states.items():
-        yield (*at, of_place.count("finished"), of_place.count("failed"), len(of_place))
+@table("counts", "")
+def _counts(analysis: Analysis) -> pd.DataFrame:
+    places = analysis.places
+    places = places[~places.streams & (places.state != "left out")]
+    done, failed = places.state == "finished", places.state == "failed"
+    return counted(places, done=done, failed=failed, planned=places.key.notna())
 
 
 @table("regions", "")

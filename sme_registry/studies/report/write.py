@@ -235,7 +235,7 @@ def page(
         absent=absent,
         explorers=explorers,
         origin=_origin(analysis),
-        missing=_missing(analysis),
+        missing=pd.concat([analysis.missing(streams=streams) for streams in (False, True)]),
         max_missing=_MAX_MISSING,
     )
 
@@ -263,11 +263,6 @@ def _kinds(analysis: Analysis) -> list[str]:
     plan = analysis.plan
     classes = [plural(len(plan.classes), "class", "classes")] if plan.classes else []
     return [*classes, plural(len(plan.streams), "stream")] if plan.streams else classes
-
-
-def _missing(analysis: Analysis) -> list[tuple[str, str]]:
-    missing = [*analysis.missing(streams=False), *analysis.missing(streams=True)]
-    return [(label(planned), analysis.errors.get(planned.cell.digest, "")) for planned in missing]
 
 
 def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
