@@ -10,7 +10,8 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import Json, changes
 from sme_registry.cli.plan import Agents, Jobs
-from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.io import choice
 from sme_registry.io.system import module_file
 from sme_registry.io.terminal import count, out, print_json, print_line, print_note
 from sme_registry.training.algorithms import nested_hyperparameters
@@ -178,13 +179,8 @@ def _show(name: str | None, json: bool) -> None:
     from sme_registry.profiles.document import Profile
 
     known = Profile.references()
-    found = {key.casefold(): each for key, each in known.items()}.get((name or "").casefold())
-    if found is None:
-        near = did_you_mean(name, known) if name else ""
-        raise UnknownNameError(
-            f"show {name or ''}: must be one of the references {', '.join(known)}.{near}"
-        )
-    _print(found, json)
+    exact = {key.casefold(): key for key in known}.get((name or "").casefold(), name)
+    _print(known[choice("show", exact, known, error=UnknownNameError)], json)
 
 
 def _print(made: Any, json: bool) -> None:

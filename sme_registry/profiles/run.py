@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
-from sme_registry.io import check_writable, require_packages
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.io import check_writable, choice, require_packages
 from sme_registry.io.system import module_file
 from sme_registry.profiles.document import Profile, ProfileFailure, row_of
 from sme_registry.profiles.levels import AXES, DEFAULT, plan_file
@@ -184,7 +184,7 @@ def profile_of(
     """
     ledger, released = Ledger(folder), plan_file()
     plan = ledger.study_file().plan
-    chosen = _chosen(plan, algorithm, folder)
+    chosen = _chosen(plan, algorithm)
     file = study_of(chosen, steps=chosen.steps or plan.steps or None, seeds=plan.seeds)
     names = tuple(m.name for m in file.plan.classes) if classes is None else tuple(classes)
     of_study = [each.cell for each in plan.cells if each.algorithm == chosen.name]
@@ -224,14 +224,8 @@ def _task(cell: Cell) -> tuple[str, int, int, str]:
     return cell.spec.digest, cell.seed, cell.steps, cell.protocol.digest
 
 
-def _chosen(plan: StudyPlan, name: str | None, folder: Any) -> StudyAlgorithm:
+def _chosen(plan: StudyPlan, name: str | None) -> StudyAlgorithm:
     known = {algorithm.name: algorithm for algorithm in plan.algorithms}
     if name is None and len(known) == 1:
         return plan.algorithms[0]
-    if name not in known:
-        near = did_you_mean(name, known) if name else " Choose one with --algorithm."
-        raise UnknownNameError(
-            f"algorithm={name!r}: must be one of the study in {str(folder)!r}: "
-            f"{', '.join(known)}.{near}"
-        )
-    return known[name]
+    return known[choice("algorithm", name, known, error=UnknownNameError)]

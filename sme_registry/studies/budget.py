@@ -14,6 +14,7 @@ from fnmatch import fnmatchcase
 from operator import attrgetter
 
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
+from sme_registry.io import choice
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.result import CellResult
@@ -79,11 +80,7 @@ def scaled(
     steps_of = dict(steps_of or {})
     known = [algorithm.name for algorithm in file.plan.algorithms]
     for name in steps_of:
-        if name not in known:
-            raise UnknownNameError(
-                f"steps={name}={steps_of[name]}: the plan has no such algorithm."
-                f"{did_you_mean(name, known)} Its algorithms: {', '.join(known)}."
-            )
+        choice("steps", name, known, error=UnknownNameError)
     if (steps is not None or steps_of) and not file.plan.classes:
         raise OptionError(
             f"steps={steps or dict(steps_of)}: lives have the steps of their streams, and the plan "

@@ -281,7 +281,7 @@ class TestRun:
         write_page(profile, tmp_path / "out", [])
         page = (tmp_path / "out" / "profile.html").read_text()
         assert "4 of 8 finished, 4 not run" in page
-        with pytest.raises(UnknownNameError, match="Choose one with --algorithm"):
+        with pytest.raises(UnknownNameError, match="algorithm=None: must be 'linear' or"):
             run.profile_of("study")
 
 

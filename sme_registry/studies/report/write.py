@@ -28,16 +28,16 @@ from typing import Any, NamedTuple
 import pandas as pd
 from markupsafe import Markup
 
-from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, SMEError, UnknownNameError
 from sme_registry.explorer import explorer_page, facts
-from sme_registry.io import check_writable, to_json, write_atomically
+from sme_registry.io import check_writable, choice, to_json, write_atomically
 from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
 from sme_registry.plots.style import WRITTEN
 from sme_registry.spec import StudyFile
 from sme_registry.studies.ledger import REPORT, Ledger, label, requested
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.design import Metric, metrics_of
+from sme_registry.studies.report.design import metrics_of
 from sme_registry.studies.report.figures import (
     draw,
     draw_differences,
@@ -345,8 +345,13 @@ def compare(
             )
         study = load(study)
     finished = runs_of(study.results)
-    _check_names(first, second, list(dict.fromkeys(finished.algorithm)))
-    chosen = [_metric(name, metrics_of("run", finished.columns)) for name in metrics]
+    names = list(dict.fromkeys(finished.algorithm))
+    for name in (first, second) if names else ():
+        choice("algorithm", name, names, error=UnknownNameError)
+    if first == second:
+        raise OptionError(f"{first!r}: is given twice. Give two different algorithms.")
+    known = {metric.key: metric for metric in metrics_of("run", finished.columns)}
+    chosen = [known[choice("metric", key, known, error=UnknownNameError)] for key in metrics]
     table = frame([*differences(finished, [(first, second)], chosen)], DIFFERENCES)
     if table.empty:
         raise OptionError(
@@ -382,23 +387,3 @@ def write_comparison(
     for picture in draw((draw_differences, draw_class_curves), analysis, WRITTEN)[0]:
         contents |= {f"{picture.name}.{ending}": picture.files[ending] for ending in WRITTEN}
     return [write_atomically(Path(out) / name, content) for name, content in contents.items()]
-
-
-def _check_names(first: str, second: str, known: Sequence[str]) -> None:
-    for name in (first, second):
-        if name not in known:
-            raise UnknownNameError(
-                f"{name!r}: the study has no finished run of such an algorithm."
-                f"{did_you_mean(name, known)} Its algorithms: {', '.join(known) or 'none'}."
-            )
-    if first == second:
-        raise OptionError(f"{first!r}: is given twice. Give two different algorithms.")
-
-
-def _metric(name: str, metrics: Sequence[Metric] = metrics_of("run")) -> Metric:
-    known = {metric.key: metric for metric in metrics}
-    if name not in known:
-        raise UnknownNameError(
-            f"metric={name!r}: must be one of {', '.join(known)}.{did_you_mean(name, known)}"
-        )
-    return known[name]

@@ -138,7 +138,7 @@ def test_comparisons_have_the_metrics_too(study):
     assert set(rows) == {("wd_cost", "safe"), ("wd_sensitivity", "driven")}
     assert rows["wd_cost", "safe"].verdict != "worse"  # ½ is within most limits
     plain = study_frames(only(study, "plain")[0].plan, results)
-    with pytest.raises(UnknownNameError, match="metric='wd_cost': must be one of wd_regret"):
+    with pytest.raises(UnknownNameError, match="metric='wd_cost': must be 'wd_regret'"):
         compare(plain, *pair, ["wd_cost"])
 
 

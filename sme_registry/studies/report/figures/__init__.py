@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,6 @@ from sme_registry.studies.report.figures.panels import (
     INDICATION,
     WIDTH,
     Drawn,
-    Look,
     Picture,
     dims,
     epsilon_remark,
@@ -146,8 +145,7 @@ def draw_lives(analysis: Analysis) -> Drawn:
     shown = [metric for metric in metrics_of("life") if metric.key in _OF_LIVES]
     yield from _forest(
         analysis, rows[rows.region == WITHIN], "iqm", shown, "{label}\n({worse} is worse)",
-        neutral=lambda metric: metric.neutral, looks=curves.stream_looks(analysis),
-        share_x=False,
+        neutral=lambda metric: metric.neutral, share_x=False,
         name="stream-metrics",
         title="Performance, forgetting and plasticity of whole lives",
         caption=f"{curves.OVER_LIVES} Black lines: the constant ½, no forgetting, and as good as a "
@@ -163,7 +161,6 @@ def _forest(
     label: str,
     place: str = "class_name",
     *,
-    looks: Mapping[str, Look] | None = None,
     neutral: Callable[[Metric], float] | None = None,
     share_x: bool = True,
     name: str,
@@ -176,7 +173,7 @@ def _forest(
     if rows.empty:
         return
     places = _places(analysis, rows, place)
-    looks = looks or looks_of(analysis, rows.algorithm) or {"": new_look("black", "o")}
+    looks = looks_of(analysis, rows.algorithm) or {"": new_look("black", "o")}
 
     def draw_metric(axes: Axes, metric: Metric) -> None:
         of_metric = rows[rows.metric == metric.key]

@@ -201,7 +201,7 @@ def draw_lifetime_curves(analysis: Analysis) -> Drawn:
             f"{curves_caption(rows)} Mean exact regret per step in evaluations during training, on "
             "the task in force. Shades and numbers above are visits and their phases.",
             _lines_by_class(
-                rows, stream_looks(analysis),
+                rows, looks_of(analysis, rows.algorithm),
                 lambda axes, name: _finish_lifetime(axes, analysis, name), {}, _HEIGHTS,
                 x="lifetime (steps)", title_pad=_PAD,
             ),
@@ -318,8 +318,11 @@ def _class_labels(group: Group, *, with_symbol: bool = False) -> list[str]:
 
 def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
     """The dynamic regret over the lifetime, one panel a stream."""
-    looks = {name: {**look, "linestyle": "-"} for name, look in stream_looks(analysis).items()}
     regret, references = (analysis.tables[f"stream_{n}"] for n in ("regret", "reference_regret"))
+    looks = {
+        name: {**look, "linestyle": "-"}
+        for name, look in looks_of(analysis, regret.algorithm).items()
+    }
 
     def draw_stream(axes: Axes, name: str) -> None:
         rows = regret[regret.class_name == name]
@@ -356,7 +359,7 @@ def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
     rows = rows[rows.metric == "plasticity_ratio"]
     if rows.empty:
         return
-    looks = stream_looks(analysis)
+    looks = looks_of(analysis, rows.algorithm)
 
     def draw_stream(axes: Axes, name: str) -> None:
         for algorithm, look, shift in panels.side_by_side(looks, 0.4):
@@ -443,13 +446,6 @@ def _finish_lifetime(axes: Axes, analysis: Analysis, name: str) -> None:
     panels.tick_steps(axes)
     axes.set_xlim(0.0, visits[-1].lifetime)
     shade_visits(axes, visits)
-
-
-def stream_looks(analysis: Analysis) -> dict[str, Look]:
-    """The looks of the algorithms that have lives; as in the figures of single tasks."""
-    names = (*analysis.coloured, *analysis.learners, *analysis.stream_algorithms)
-    looks = panels.numbered_looks(dict.fromkeys(names))
-    return {name: look for name, look in looks.items() if name in analysis.stream_algorithms}
 
 
 def _within(rows: pd.DataFrame) -> pd.DataFrame:

@@ -72,12 +72,11 @@ CONSTANT = new_look(GREY, dash=REFERENCE_DASHES["constant"])
 
 def looks_of(analysis: Analysis, names: Iterable[str] | None = None) -> dict[str, Look]:
     """The look of each algorithm, or of these: colours for those that learn, grey for others."""
-    numbered = numbered_looks(dict.fromkeys((*analysis.coloured, *analysis.learners)))
-    looks = {name: numbered[name] for name in analysis.learners}
-    references = [name for name in analysis.algorithms if name not in looks]
-    for i, name in enumerate(references):
+    looks = numbered_looks(dict.fromkeys((*analysis.coloured, *analysis.learners)))
+    others = dict.fromkeys((*analysis.algorithms, *analysis.stream_algorithms))
+    for i, name in enumerate(name for name in others if name not in looks):
         looks[name] = new_look(GREY, "x+12"[i % 4], DASHES[1 + i % 4])
-    present = set(looks if names is None else names)
+    present = set(analysis.algorithms if names is None else names)
     return {name: look for name, look in looks.items() if name in present}
 
 
