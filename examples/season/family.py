@@ -38,7 +38,6 @@ from sme_registry import seasons
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import read_json
-from sme_registry.seasons import wire
 from sme_registry.spec import Setting
 
 Float32 = npt.NDArray[np.float32]
@@ -248,7 +247,7 @@ def play_offline(published: Path, folder: Path, effort: int) -> None:
     for member in season["classes"]:
         setting = Setting.from_dict(member["setting"])
         for number in range(member["instances"]):
-            begun, name = time.process_time(), wire.instance_name(member["name"], number)
+            begun, name = time.process_time(), f"{member['name']}-{number}"
             data = SealedDataset.read(published / f"datasets/sealed/{season['id']}/{name}-v0")
             net = learn(data, setting, number, effort)
             np.save(folder / f"{name}.npy", net.act(np.load(published / f"challenges/{name}.npy")))

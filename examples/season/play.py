@@ -29,7 +29,6 @@ from sme_registry import seasons
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import BudgetSpentError, SMEError
 from sme_registry.io import read_json
-from sme_registry.seasons import wire
 
 SAVE_EVERY = 500  # steps, which are all that a killed player forgets
 BEST, NEIGHBOURS = 4, 8  # of the table: a quarter of the rows, by reward
@@ -137,7 +136,7 @@ def main() -> int:
             season = read_json(arguments.published / "season.json")
             for member in season["classes"]:
                 for number in range(member["instances"]):
-                    name = wire.instance_name(member["name"], number)
+                    name = f"{member['name']}-{number}"
                     file = arguments.out / f"{name}.npy"
                     answer_from_table(arguments.published, name, season["id"], file)
         else:

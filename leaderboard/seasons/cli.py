@@ -29,7 +29,7 @@ from leaderboard.seasons.scoring import (
     score_entries,
     season_rankings,
 )
-from leaderboard.seasons.season import Master, Reveal, Terms
+from leaderboard.seasons.season import Master, Reveal, Season
 from leaderboard.seasons.store import SeasonRow, SeasonStore
 from sme_registry import SMESpec, materialize
 from sme_registry.errors import OptionError
@@ -102,7 +102,8 @@ def new(
     # First: a season whose master is lost cannot be revealed, and the reverse does no harm.
     master = Master.generate()
     master.write(path)
-    with Progress("generating", len(fields.published), console=err(), unit="instances") as progress:
+    count = len(list(fields.hidden)) if fields.track == "sealed-offline" else 0
+    with Progress("generating", count, console=err(), unit="instances") as progress:
         try:
             season = create_season(fields, master, folder, progress.update_of)
         except BaseException:
@@ -189,9 +190,8 @@ def close(board: BoardFolder, season: SeasonId) -> None:
             {"number": "number", "method": "text", "submitter": "text", "received": "name"},
         )
         for each in counting(store, store.season(season)):
-            entrant = each.entrant
-            names = f"{entrant.method} {entrant.version}", entrant.submitter
-            table.add_row(str(each.number), *map(escape, names), entrant.received)
+            names = f"{each.method} {each.version}", each.submitter
+            table.add_row(str(each.number), *map(escape, names), each.received)
         head = store.head
     out().print(table)
     out().print(f"log entry {head.sequence} {head.digest}", soft_wrap=True)
@@ -215,7 +215,7 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
         count = len(store.entrants(row.digest))
         with Progress("scoring", count, console=err(), unit="entries") as progress:
             scored = score_entries(store, row.digest, progress.update_of)
-    out().print(f"{row.id}: revealed, {plural(scored, *_UNITS[row.track])} scored.")
+    out().print(f"{row.id}: revealed, {plural(scored, *_UNITS[row.kind])} scored.")
 
 
 @season.command()
@@ -261,7 +261,7 @@ def show(
         print_json({**facts, "metric": metric, "ranking": plain})
         return
     print_pairs(escape(row.title), {name: fact for name, fact in facts.items() if fact is not None})
-    _, units = _UNITS[row.track]
+    _, units = _UNITS[row.kind]
     of_key: dict[str, Callable[[RankedRow], str]] = {
         "methods": lambda row: str(keys[row.entry.key].methods),
         units: lambda row: str(keys[row.entry.key].entries),
@@ -279,9 +279,9 @@ def _open(board: Path) -> SeasonStore:
     return store
 
 
-def _warn_of_easy_classes(terms: Terms) -> None:
+def _warn_of_easy_classes(plan: Season) -> None:
 
-    for member in terms.classes:
+    for member in plan.classes:
         rows = member.data.transitions if member.data else member.budget or 0
         regret = table_regret(member.setting, rows)
         if regret < EASY:
@@ -300,13 +300,13 @@ def _facts(store: SeasonStore, row: SeasonRow) -> dict[str, Any]:
     return {
         "id": row.id,
         "digest": row.digest,
-        "track": row.track,
+        "track": row.kind,
         "state": row.state(store.clock.time),
         "opens": row.opens,
         "closes": row.closes,
         "instances": row.instances,
-        "keys": len({each.entrant.key for each in entrants}),
-        _UNITS[row.track][1]: len(entrants),
+        "keys": len({each.key for each in entrants}),
+        _UNITS[row.kind][1]: len(entrants),
         "admission": document.admission,
         "admitted": None if document.admission == "open" else len(store.admitted(row.digest)),
         "commitment": document.commitment,

@@ -29,7 +29,7 @@ from leaderboard.cli.submit import (
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.seasons.publication import name_of, read_season
+from leaderboard.seasons.publication import read_season
 from leaderboard.seasons.scoring import enter as enter_folder
 from leaderboard.seasons.season import Entry, Season, TicketRequest
 from leaderboard.seasons.store import SeasonStore
@@ -47,7 +47,7 @@ from sme_registry.io.markup import Table, plural
 from sme_registry.io.terminal import Progress, err, out
 from sme_registry.seasons import WITHOUT_TASK, Instance, Ticket, actions_in, prepare_policy
 from sme_registry.seasons.transcript import Signer
-from sme_registry.seasons.wire import TicketPlace, pack_table, tickets_path, unpack_table
+from sme_registry.seasons.wire import Hidden, TicketClass, pack_table, tickets_path, unpack_table
 
 app = typer.Typer()
 
@@ -256,7 +256,7 @@ def answer(
 
 
 def _prepared(
-    policy: str, place: TicketPlace, action_range: str | None, algorithm: str | None
+    policy: str, place: Hidden[TicketClass], action_range: str | None, algorithm: str | None
 ) -> Any:
     """A policy, or the array of actions in a file."""
 
@@ -312,7 +312,7 @@ def enter(
     """
 
     season, signing_key = read_season(published), own_key(key)
-    hidden = {name_of(each): each.member.setting for each in season.hidden}
+    hidden = {each.name: each.member.setting for each in season.hidden}
     without = failed or []
     for name in without:
         if name not in hidden:

@@ -105,19 +105,11 @@ class Instance:
         return journal.steps + journal.lanes > self.budget
 
     @property
-    def is_played(self) -> bool:
-        """Whether the entrant has signed or answered anything."""
-        paths = [self._signed_path, self._answers_path]
-        if self._is_old:
-            paths.append(self._journal_path)
-        return any(path.exists() for path in paths)
-
-    @property
     def journal(self) -> Journal | None:
         with self._lock:
             if self._journal is None and self._journal_path.exists():
                 snapshot = self._snapshot()
-                known = 0 if snapshot is None else int(snapshot["counts"][0])
+                known = 0 if snapshot is None else int(snapshot["requests"])
                 with storage():
                     self._journal = Journal.open(self._journal_path, known)
             return self._journal
@@ -229,10 +221,11 @@ class Instance:
     def finish(self, signature: str) -> None:
         with self._lock:
             self._check_running()
-            journal, play = self._started(), self._playing()
-            self._sign(play, signature)
-            with storage():
-                journal.end()
+            journal = self._started()
+            if not journal.ended:
+                self._sign(self._playing(), signature)
+                with storage():
+                    journal.end()
             self.release()
 
     def challenge(self) -> bytes:
@@ -277,21 +270,7 @@ class Instance:
         return signed.content.head if signed is not None and self.answered else None
 
     def stepping(self) -> Stepping:
-        """The regret of the steps that the entrant has signed, as it was summed when they came."""
-        with self._lock:
-            journal, signed = self.journal, self.signed
-            if journal is None or not (self._is_old or self._signed_path.exists()):
-                return no_steps(self.budget, journal.lanes if journal else 1)
-            if signed is None:
-                return self.replayed()
-            play = self._playing()
-            self.release()
-        if play.signed != min(signed.content.hashes, play.requests):
-            return self.replayed()
-        return play.stepping.model_copy(update={"signed": self.signed_digest})
-
-    def replayed(self) -> Stepping:
-        """`stepping`, from the journal alone."""
+        """The regret of the steps that the entrant has signed, which are taken again."""
         signed, digest = self.signed, self.signed_digest
         if not self._journal_path.exists():
             return no_steps(self.budget)
@@ -302,7 +281,6 @@ class Instance:
             last = 0 if signed is None else min(last, signed.content.hashes)
         for body in journal.bodies(0, last):
             play.take(body)
-        play.sign()
         self._check_signed(journal, play, signed)
         return play.stepping.model_copy(update={"signed": digest})
 
@@ -367,7 +345,7 @@ class Instance:
         if self._play is None:
             journal, snapshot = self._started(), self._snapshot()
             play = self._new_play(journal.lanes)
-            if snapshot is not None and snapshot["counts"][0] <= journal.requests:
+            if snapshot is not None and snapshot["requests"] <= journal.requests:
                 play.restore(snapshot)
             for body in journal.bodies(play.requests):
                 play.take(body)
@@ -384,14 +362,11 @@ class Instance:
             return None
 
     def _sign(self, play: Play, signature: str) -> None:
-        """Store the entrant's signature of all steps so far, once."""
-        if play.signed == play.requests:
-            return
+        """Store the entrant's signature of all steps so far."""
         signed = self._signed(play.requests, play.head, signature)
         with storage():
             self.sync()
             write_whole(self._signed_path, signed.to_bytes())
-            play.sign()
             write_whole(self._snapshot_path, play.snapshot())
 
     def _signed(self, number: int, head: bytes, signature: str) -> SignedHead:

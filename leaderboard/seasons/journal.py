@@ -13,7 +13,8 @@ kill in the middle of a write, leaves of the last record is ignored, and cut off
 `Play`: one hidden instance after so many requests: its lanes, its transcript, and the regret.
 
 All follows from the start and the requests, so a replay of the same actions gives the same numbers,
-bit for bit, and so does a snapshot. `L` lanes, `S` state_dim, `A` action_dim.
+bit for bit. A snapshot has what the next steps need, without the regret, which is that of a replay.
+`L` lanes, `S` state_dim, `A` action_dim.
 
     normalised online regret = Σ regret / Σ regret of the constant ½ in the same states
 
@@ -219,8 +220,7 @@ class Play:
         self._possible = budget // lanes
         # Regret, that of the constant ½, and requests, of each part of the budget.
         self._sums = np.zeros((min(MOST_PARTS, self._possible), 3))
-        self._signed_sums = self._sums.copy()
-        self.requests, self.signed, self.last = 0, -1, (b"", b"")
+        self.requests, self.last = 0, (b"", b"")
         self.head = chain.first_head(lanes, self.started)
 
     @property
@@ -251,28 +251,23 @@ class Play:
         self.requests += 1
         return answer
 
-    def sign(self) -> None:
-        self.signed, self._signed_sums = self.requests, self._sums.copy()
-
     @property
     def stepping(self) -> Stepping:
-        """The regret of the steps that the entrant has signed."""
+        """The regret of all steps; not of those before a snapshot."""
         parts = len(self._sums)
         firsts = -(np.arange(parts + 1) * -self._possible // parts)  # request of each part
         return Stepping(
-            steps=max(self.signed, 0) * self._format.lanes,
-            normalised_online_regret=_ratio(self._signed_sums.sum(axis=0), self._possible),
-            learning_curve=tuple(map(_ratio, self._signed_sums, np.diff(firsts))),
+            steps=self.requests * self._format.lanes,
+            normalised_online_regret=_ratio(self._sums.sum(axis=0), self._possible),
+            learning_curve=tuple(map(_ratio, self._sums, np.diff(firsts))),
         )
 
     def snapshot(self) -> bytes:
         stream = streams.BytesIO()
         texts = {"head": self.head, "body": self.last[0], "answer": self.last[1]}
         arrays: dict[str, Any] = {
-            "counts": np.array([self.requests, self.signed]),
+            "requests": np.array(self.requests),
             "observation": self._observation,
-            "sums": self._sums,
-            "signed_sums": self._signed_sums,
             **{name: np.frombuffer(text, np.uint8) for name, text in texts.items()},
             **self._env.snapshot(),
         }
@@ -282,9 +277,8 @@ class Play:
     def restore(self, snapshot: Arrays) -> None:
         """Go on from the arrays of a snapshot of the same start."""
         self._env.restore(snapshot, self._seed)
-        self.requests, self.signed = snapshot["counts"].tolist()
+        self.requests = int(snapshot["requests"])
         self._observation = snapshot["observation"]
-        self._sums, self._signed_sums = snapshot["sums"], snapshot["signed_sums"]
         self.head = snapshot["head"].tobytes()
         self.last = snapshot["body"].tobytes(), snapshot["answer"].tobytes()
 

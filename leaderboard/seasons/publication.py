@@ -43,13 +43,12 @@ from leaderboard.seasons.scoring import (
     sealed_result,
 )
 from leaderboard.seasons.season import (
-    MAX_INSTANCES,
+    PLANNED,
     Digests,
-    Hidden,
     Master,
     SealedResult,
     Season,
-    Terms,
+    SeasonClass,
     rows_of,
 )
 from leaderboard.seasons.store import SealedRow, SeasonRow, SeasonStore
@@ -59,73 +58,51 @@ from leaderboard.web.client import Files
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import build_folder, read_json, read_regular, sha256_of, to_json, versions
-from sme_registry.seasons.wire import instance_name, table_bytes
+from sme_registry.seasons.wire import Hidden, table_bytes
 from sme_registry.task.engine import chosen_backend
 
 SEASON = "season.json"
-_UNKNOWN = "sha256:" + "0" * 64
 
 
-def name_of(hidden: Hidden) -> str:
-    return instance_name(hidden.member.name, hidden.instance)
+def challenge_path(folder: Path, hidden: Hidden[SeasonClass]) -> Path:
+    return folder / "challenges" / f"{hidden.name}.npy"
 
 
-def challenge_path(folder: Path, hidden: Hidden) -> Path:
-    return folder / "challenges" / f"{name_of(hidden)}.npy"
-
-
-def dataset_path(folder: Path, season: str, hidden: Hidden) -> Path:
+def dataset_path(folder: Path, season: str, hidden: Hidden[SeasonClass]) -> Path:
     return folder / "datasets" / _dataset_id(season, hidden)
 
 
-def refuse_unfit(terms: Terms, limit: int, runs_to_rank: int) -> None:
+def refuse_unfit(plan: Season, limit: int, runs_to_rank: int) -> None:
     """Refuse a season whose answers a board does not take, or in which nobody has a rank."""
-    for member in terms.classes:
-        size = table_bytes(rows_of(terms.protocol), member.setting.action_dim)
+    for member in plan.classes:
+        size = table_bytes(rows_of(plan.protocol), member.setting.action_dim)
         if size > limit:
             raise BoardError(
                 f"classes.{member.name}: its answers have {size:,} bytes: must be at most "
                 f"{limit:,}, the board's limit on artefacts. Use fewer states per region."
             )
-        most = member.instances * (terms.tickets_per_key or 1)
+        most = member.instances * (plan.tickets_per_key or 1)
         if most < runs_to_rank:
             raise BoardError(
                 f"classes.{member.name}: a key has at most {most} runs in it: must be at least "
                 f"{runs_to_rank}, which a rank on this board needs. Use more instances"
-                f"{' or tickets_per_key' if terms.track == 'sealed-online' else ''}, or a board "
+                f"{' or tickets_per_key' if plan.track == 'sealed-online' else ''}, or a board "
                 "for practice."
             )
 
 
-def read_plan(plan: Any, source: str = "plan") -> Terms:
-    """The terms of a season that is not generated yet, with digests of zeros.
-
-    `plan` has the fields of `Terms` but `published`; `protocol` may be left out.
-    """
-    fields = dict(plan) if isinstance(plan, dict) else {}
-    name = fields.get("protocol_name")
-    if "protocol" not in fields and isinstance(name, str):
-        fields["protocol"] = resolve_protocol(name).model_copy(update={"seed": 0}).to_dict()
-    if fields.get("track") == "sealed-offline":
-        fields["published"] = _unknown(fields.get("classes"))
-    return Terms.from_dict(fields if fields else plan, source)
-
-
-def _unknown(classes: Any) -> list[dict[str, Any]]:
-    """The list of instances of classes that may be invalid, with digests of zeros."""
-    listed = []
-    for member in classes if isinstance(classes, list) else []:
-        match member:
-            case {"name": name, "instances": int(count)}:
-                listed += [
-                    {"class_name": name, "instance": i, "data": _UNKNOWN, "challenge": _UNKNOWN}
-                    for i in range(min(count, MAX_INSTANCES))
-                ]
-    return listed
+def read_plan(plan: Any, source: str = "plan") -> Season:
+    """A season that is not generated yet: `protocol` and what follows later may be left out."""
+    if isinstance(plan, dict):
+        plan = {"commitment": PLANNED, **plan}
+        name = plan.get("protocol_name")
+        if "protocol" not in plan and isinstance(name, str):
+            plan["protocol"] = resolve_protocol(name).model_copy(update={"seed": 0}).to_dict()
+    return Season.from_dict(plan, source)
 
 
 def create_season(
-    plan: Terms,
+    plan: Season,
     master: Master,
     folder: str | os.PathLike[str],
     progress: Progress | None = None,
@@ -145,7 +122,7 @@ def create_season(
             "published": [each.to_dict() for each in published],
             "versions": versions(["numpy", "scipy", *numba]),
         }
-        season = Terms.from_dict(fields).commit(master)
+        season = Season.from_dict(fields).commit(master)
         (Path(building) / SEASON).write_text(to_json(season.to_dict()))
     return season
 
@@ -283,8 +260,8 @@ def _publish(instance: HiddenTask, season: str, master: Master, folder: Path) ->
     )
 
 
-def _dataset_id(season: str, hidden: Hidden) -> str:
-    return f"sealed/{season}/{name_of(hidden)}-v0"
+def _dataset_id(season: str, hidden: Hidden[SeasonClass]) -> str:
+    return f"sealed/{season}/{hidden.name}-v0"
 
 
 def verify_seasons(
@@ -345,7 +322,7 @@ class _SeasonVerifier:
     def check_ends(self) -> None:
         """Check that no ticket ended early; all else that is forbidden no log can have."""
         for row in self.entrants if self.is_online else ():
-            if row.result is not None and row.entrant.policies < row.entrant.runs:
+            if row.result is not None and row.policies < row.runs:
                 self.refuse_early(row, "without all answers")
 
     def refuse_early(self, row: SealedRow, lack: str) -> None:
@@ -398,7 +375,7 @@ class _SeasonVerifier:
         left = sum(row.result is None for row in counted)
         self.findings.compare(
             (
-                (self.name(row.entrant.id), self.store.sealed_result(row), here)
+                (self.name(row.id), self.store.sealed_result(row), here)
                 for row, here in zip(whole, self.scored(master, whole), strict=True)
             ),
             (left, "not scored yet: repeat `sme-leaderboard season reveal`"),
@@ -421,7 +398,7 @@ class _SeasonVerifier:
             ticket = Ticket(self.store, self.season, master, row)
             if not ticket.is_ended:
                 self.refuse_early(row, "without the entrant's end")
-            yield score_ticket(self.store, self.season, ticket, replay=True)
+            yield score_ticket(self.store, self.season, ticket)
 
     def contradiction(self, result: SealedResult) -> Difference | None:
         """The first value of a result that does not follow from the regrets of its runs."""
@@ -443,4 +420,4 @@ class _SeasonVerifier:
 
     def refuse(self, row: SealedRow, message: str) -> NoReturn:
         kind = "ticket" if self.is_online else "entry"
-        raise TamperedError(f"{self.of.id}: {kind} {row.number} ({row.entrant.id})", message)
+        raise TamperedError(f"{self.of.id}: {kind} {row.number} ({row.id})", message)

@@ -44,19 +44,15 @@ from leaderboard.scoring.ranking import (
 from leaderboard.seasons.season import (
     Entry,
     Float32,
-    Hidden,
     Master,
     Place,
     SealedResult,
     Season,
+    SeasonClass,
     Stepping,
-    Terms,
     read_answers,
 )
-from leaderboard.seasons.store import (
-    SealedRow,
-    SeasonStore,
-)
+from leaderboard.seasons.store import SealedRow, SeasonStore
 from leaderboard.web.tables import row_facts
 from sme_registry import EvaluationProtocol, SMESpec
 from sme_registry.errors import PolicyError
@@ -66,7 +62,7 @@ from sme_registry.evaluation import (
     evaluate_many,
     evaluation_observations,
 )
-from sme_registry.seasons.wire import pack_table
+from sme_registry.seasons.wire import Hidden, pack_table
 
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch", "onnxruntime")
@@ -76,7 +72,7 @@ _UNUSED = ("stable_baselines3", "torch", "onnxruntime")
 class HiddenTask:
     """One hidden instance, as far as the master determines it; `repr` shows nothing of that."""
 
-    hidden: Hidden
+    hidden: Hidden[SeasonClass]
     place: Place  # of its secrets
     spec: SMESpec
     protocol: EvaluationProtocol  # of its challenge states
@@ -84,18 +80,23 @@ class HiddenTask:
 
     @classmethod
     def of(
-        cls, terms: Terms, master: Master, hidden: Hidden, ticket: str = "", nonce: str = ""
+        cls,
+        season: Season,
+        master: Master,
+        hidden: Hidden[SeasonClass],
+        ticket: str = "",
+        nonce: str = "",
     ) -> HiddenTask:
         """An instance of a season, or of one of its tickets, by its number and its nonce."""
         member = hidden.member
-        place = Place(terms.id, member.name, hidden.instance, ticket, nonce)
+        place = Place(season.id, member.name, hidden.instance, ticket, nonce)
         spec = SMESpec.from_dict({**member.setting.to_dict(), "seed": master.seed(place)})
-        protocol = terms.protocol.model_copy(update={"seed": master.states_seed(place)})
+        protocol = season.protocol.model_copy(update={"seed": master.states_seed(place)})
         starts = int.from_bytes(master.secret("starts", place))
         return cls(hidden, place, spec, protocol, starts)
 
     def __repr__(self) -> str:
-        return f"HiddenTask({self.hidden.member.name}, {self.hidden.instance})"
+        return f"HiddenTask({self.hidden.name})"
 
     @property
     def challenge(self) -> bytes:
@@ -104,10 +105,10 @@ class HiddenTask:
 
 
 def instances(
-    terms: Terms, master: Master, ticket: str = "", nonce: str = ""
+    season: Season, master: Master, ticket: str = "", nonce: str = ""
 ) -> Iterator[HiddenTask]:
     """Every hidden instance of a season, or of one of its tickets, in order."""
-    return (HiddenTask.of(terms, master, hidden, ticket, nonce) for hidden in terms.hidden)
+    return (HiddenTask.of(season, master, hidden, ticket, nonce) for hidden in season.hidden)
 
 
 Answered = tuple[Float32 | None, str | None]
@@ -213,10 +214,10 @@ def counting(store: SeasonStore, season: Season) -> list[SealedRow]:
         return rows
     last: dict[tuple[str, str], SealedRow] = {}
     for row in rows:
-        other = last.get(row.method, row)
+        other = last.get(row.attempt, row)
         # One that was signed before and delivered later is nobody's last word.
         if row.created >= other.created:
-            last[row.method] = row
+            last[row.attempt] = row
     return sorted(last.values(), key=lambda row: row.number)
 
 
@@ -229,8 +230,8 @@ class OfKey(NamedTuple):
 
 def by_key(store: SeasonStore, season: Season) -> dict[str, OfKey]:
     rows = store.entrants(season.digest)
-    methods = Counter(key for key, _ in {row.method for row in rows})
-    entries = Counter(row.entrant.key for row in rows)
+    methods = Counter(key for key, _ in {row.attempt for row in rows})
+    entries = Counter(row.key for row in rows)
     return {key: OfKey(methods[key], count) for key, count in entries.items()}
 
 
@@ -300,7 +301,7 @@ def _scored_at_once(
             versions[entry] |= used
     for row, of_entry, used in zip(rows, runs, versions, strict=True):
         draws, rules = store.document.draws, store.document.rules
-        yield sealed_result(season, row.entrant.id, of_entry, used, draws, rules=rules)
+        yield sealed_result(season, row.id, of_entry, used, draws, rules=rules)
 
 
 def _read(store: SeasonStore, instance: HiddenTask, answer: Artefact | None) -> Answered:
@@ -316,24 +317,23 @@ def _methods(
     """A row for each key and method; those of several tickets are scored over all their runs."""
     groups: dict[tuple[str, str], list[SealedRow]] = {}
     for row in rows:
-        groups.setdefault(row.method, []).append(row)
+        groups.setdefault(row.attempt, []).append(row)
     entries = {}
     fewest = min(member.instances for member in season.classes)
-    for method, members in groups.items():
-        entrants = [row.entrant for row in members]
-        entry = entrants[-1]
+    for attempt, members in groups.items():
+        entry: EntryRow = members[-1]
         if len(members) > 1:
             scores, oracle_like = _score_together(store, season.digest, tuple(members))
             entry = replace(
                 entry,
                 scores=scores,
-                runs=sum(each.runs for each in entrants),
-                policies=sum(each.policies for each in entrants),
-                steps=sum(each.steps for each in entrants),
+                runs=sum(each.runs for each in members),
+                policies=sum(each.policies for each in members),
+                steps=sum(each.steps for each in members),
                 oracle_like=oracle_like,
             )
         enough = fewest * len(members) >= store.document.runs_to_rank
-        entries[method] = replace(entry, enough_runs=enough)
+        entries[attempt] = replace(entry, enough_runs=enough)
     return entries
 
 
@@ -366,21 +366,21 @@ def enter(
         return False
     entry, key = signed.content, signed.content.submitter.key
     check_manifest(store.document, entry, datetime.datetime.fromisoformat(store.time))
-    store.open_season(entry.season, "sealed-offline", key)
+    store.open_season(entry.season, "sealed-offline", key, store.time)
     season = store.season(entry.season)
     given = _check_answers(store, season, signed, answers)
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
         check_entrant(store, entry.submitter, len(signed.to_bytes()))
         _check_newest(store, season, entry)
         store_files(store, key, given, answers)
-        return store.add("entry", signed)[1]
+        return store.add(signed)[1]
 
 
 def _check_newest(store: SeasonStore, season: Season, entry: Entry) -> None:
     """Refuse an entry that would not count, as its key has signed a later one of its method."""
     own = entry.submitter.key, entry.method.name.casefold()
     for row in store.entrants(season.digest):
-        if row.method == own and row.created > entry.created:
+        if row.attempt == own and row.created > entry.created:
             raise Rejection(
                 "stale_time",
                 f"created={entry.created}: entry {row.number} of the same key and method was "
@@ -393,15 +393,8 @@ def _check_answers(
     store: SeasonStore, season: Season, signed: Signed[Entry], read: ReadFile | None
 ) -> list[Artefact]:
     """The answers that are not null, each in the shape of its instance's challenge."""
-    entry, hidden = signed.content, list(season.hidden)
-    if len(entry.answers) != len(hidden):
-        raise Rejection(
-            "answer_missing",
-            f"answers: has {len(entry.answers)}: must have {len(hidden)}, one for each instance of "
-            f"the season {season.id}, null where the method failed.",
-        )
-    given, checked = [], set()
-    for number, (answer, each) in enumerate(zip(entry.answers, hidden, strict=True)):
+    entry, given, checked = signed.content, [], set()
+    for number, (answer, each) in enumerate(zip(entry.answers, season.hidden, strict=False)):
         if answer is None:
             continue
         if read is None:

@@ -34,6 +34,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
+import rfc8785
 from pydantic import Field, field_serializer, field_validator, model_validator
 
 from leaderboard.documents.result import ClassScore, RunScore, Scores
@@ -49,7 +50,7 @@ from leaderboard.errors import BoardError, Rejection
 from sme_registry.errors import ActionError, WireError
 from sme_registry.io import read_regular, sha256_of
 from sme_registry.seasons.transcript import Count, Head, TicketHeads
-from sme_registry.seasons.wire import unpack_table
+from sme_registry.seasons.wire import MAX_INSTANCES, Hidden, HiddenClass, instances_of, unpack_table
 from sme_registry.spec import EvaluationProtocol, Setting
 from sme_registry.spec.document import (
     Digest,
@@ -63,14 +64,14 @@ from sme_registry.spec.document import (
 )
 
 LEAST_COMPLEXITY = 5
-MAX_INSTANCES = 1000
-"""Of all classes: a ticket has a run on each."""
-
 MAX_OFFLINE_INSTANCES = 400
 """Of a sealed-offline season: an entry lists an answer of each, in at most 64 KiB."""
 
 MAX_LANES = 256
 """Of an instance that the server steps: the most copies that one request advances."""
+
+PLANNED = "sha256:" + "0" * 64
+"""The commitment of a season that is not generated yet."""
 
 SealedTrack = Literal["sealed-offline", "sealed-online"]
 Float32 = npt.NDArray[np.float32]
@@ -89,19 +90,14 @@ class SealedData(StrictModel):
     transitions: Annotated[Integer, Field(ge=1, le=10**7)]
 
 
-class SeasonClass(Document):
+class SeasonClass(HiddenClass):
     """One kind of task. Its setting is public, the seeds of its instances are not.
 
     Attributes:
-      setting: all of a spec but its seed.
-      instances: number of hidden tasks.
       budget: steps that an entrant takes on each instance, over all lanes; null offline.
       data: the data set of each instance; null online.
     """
 
-    name: Name
-    setting: Setting
-    instances: Annotated[Integer, Field(ge=1, le=MAX_INSTANCES)]
     budget: Annotated[Integer | None, Field(ge=1, le=10**8)] = None
     data: SealedData | None = None
 
@@ -139,15 +135,8 @@ class Digests(StrictModel):
     challenge: Digest
 
 
-class Hidden(NamedTuple):
-    """One hidden instance: its class and its number in it, from 0."""
-
-    member: SeasonClass
-    instance: int
-
-
-class Terms(Document):
-    """All that is public of a season, but for its commitment.
+class Season(Document):
+    """`season.json`.
 
     Attributes:
       id: the season's name, in paths and addresses.
@@ -161,6 +150,7 @@ class Terms(Document):
       tickets, tickets_per_key: the most tickets of the season, and of one key; null offline.
       published: of each instance in order; empty online.
       versions: of the organiser's packages, by which data sets are rounded.
+      commitment: to the master and the other fields; see the head of this module.
     """
 
     fields_added_later: ClassVar[tuple[str, ...]] = ("admission",)
@@ -180,6 +170,7 @@ class Terms(Document):
     published: Annotated[tuple[Digests, ...], Field(strict=False, max_length=MAX_INSTANCES)] = ()
     versions: Annotated[dict[str, str], Field(default_factory=dict, max_length=16)]
     admission: Literal["open", "listed"] = "open"
+    commitment: Digest
 
     @model_validator(mode="after")
     def _classes_fit(self) -> Self:
@@ -209,7 +200,7 @@ class Terms(Document):
                 raise ValueError(f"{field}: must be {must} on the track {self.track}.")
         listed = [(each.class_name, each.instance) for each in self.published]
         hidden = [] if online else [(each.member.name, each.instance) for each in self.hidden]
-        if listed != hidden:
+        if listed != hidden and (listed or self.commitment != PLANNED):
             raise ValueError(
                 "published: must list every instance in the order of the classes offline, and be "
                 "empty online. Create the season with `sme-leaderboard season new`."
@@ -246,38 +237,20 @@ class Terms(Document):
         return int(hours) if hours is not None and hours.is_integer() else hours
 
     @property
-    def hidden(self) -> Iterator[Hidden]:
+    def hidden(self) -> Iterator[Hidden[SeasonClass]]:
         """Every hidden instance, class by class."""
-        for member in self.classes:
-            for instance in range(member.instances):
-                yield Hidden(member, instance)
+        return instances_of(self.classes)
 
-    def commit(self, master: Master) -> Season:
-        """The season of these terms and this master."""
-        return Season.from_dict(
-            {**self.to_dict(), "commitment": master.commitment_to(self.canonical_json())}
-        )
-
-
-class Season(Terms):
-    """`season.json`.
-
-    Attributes:
-      commitment: to the master and the terms; see the head of this module.
-    """
-
-    commitment: Digest
-
-    @property
-    def terms(self) -> Terms:
-        """The season without its commitment."""
-        fields = self.to_dict()
-        del fields["commitment"]
-        return Terms.from_dict(fields)
+    def commit(self, master: Master) -> Self:
+        """This season, committed to a master."""
+        terms = self.to_dict()
+        del terms["commitment"]
+        commitment = sha256_of(_SEAL.encode() + master.raw + rfc8785.dumps(terms))
+        return self.model_copy(update={"commitment": commitment})
 
     def is_committed_to(self, master: Master) -> bool:
         """Whether the commitment is to this master and these terms."""
-        return hmac.compare_digest(self.commitment, self.terms.commit(master).commitment)
+        return hmac.compare_digest(self.commitment, self.commit(master).commitment)
 
 
 class Admitted(Document):
@@ -471,10 +444,6 @@ class Master:
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the master into a new file that only its owner can read."""
         return write_secret(path, self.raw)
-
-    def commitment_to(self, terms: bytes) -> str:
-        """SHA-256 of the seal, this master and a season's terms: `sha256:` and 64 hex digits."""
-        return sha256_of(_SEAL.encode() + self.raw + terms)
 
     def secret(self, purpose: Purpose, place: Place) -> bytes:
         """The 32 bytes for a purpose in a place."""

@@ -1,20 +1,17 @@
 """`SeasonStore`: a board with seasons, whose tracks are seasons with entries and tickets.
 
-`Seasons` are the tables, and what log entries do to them: a function of the log and of public
-documents, which holds nothing of a hidden instance. What may change when follows from the time at
-which the log receives it.
+What it has of them is a function of the log and of public documents, and holds nothing of a hidden
+instance. What may change when follows from the time at which the log receives it.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import EntryRow, Scores
+from leaderboard.documents.result import EntryRow
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.journal import played_bytes
@@ -30,7 +27,7 @@ from leaderboard.seasons.season import (
     TicketRequest,
 )
 from leaderboard.store import Store
-from leaderboard.store.index import KINDS, Index, Kinds
+from leaderboard.store.index import Kinds
 from leaderboard.store.log import LogEntry
 
 _Signed = TypeVar("_Signed", bound=Signed[SealedManifest])
@@ -45,7 +42,7 @@ class SeasonRow(NamedTuple):
     document: str  # SHA-256 of season.json
     id: str
     title: str
-    track: SealedTrack
+    kind: SealedTrack
     opens: str
     closes: str
     instances: int  # number of hidden ones, of each ticket or of all entries
@@ -58,38 +55,54 @@ class SeasonRow(NamedTuple):
         return "announced" if time < self.opens else "open" if time < self.closes else "closed"
 
 
-@dataclass(frozen=True)
-class SealedRow:
-    season: str  # digest
+@dataclass(frozen=True, kw_only=True)
+class SealedRow(EntryRow):
+    """An entry or a ticket, which started when it was received.
+
+    Its `runs` are on hidden instances, and `policies` are answers.
+    """
+
+    track: str  # digest of its season
     number: int  # 1 for the first of its season, in the log's order
     created: str  # when it was signed, as the entrant says
     document: str  # SHA-256 of its file
     result: str | None  # SHA-256 of its result's file; None without one
     finished: str  # when it got its result; empty likewise
-    # Received when the ticket started; `runs` are hidden instances, `policies` are answers.
-    entrant: EntryRow
 
     @property
-    def method(self) -> tuple[str, str]:
+    def attempt(self) -> tuple[str, str]:
         """What it is of: a key, and the method's name in lower case."""
-        return self.entrant.key, self.entrant.method.casefold()
+        return self.key, self.method.casefold()
 
 
-class Seasons:
-    """The seasons of a board's index."""
+class SeasonStore(Store):
+    """A board with seasons, each by its digest; `name` is its id or digest."""
 
-    def __init__(self, index: Index) -> None:
-        self._index = index
+    @property
+    def kinds(self) -> Kinds:
+        return {
+            "season": self._announced,
+            "admitted": self._admitted,
+            "entry": self._entered,
+            "ticket": self._started,
+            "ended": self._finished,
+            "ranked": self._finished,
+            "revealed": self._revealed,
+        }
 
-    def rows(self) -> list[SeasonRow]:
+    def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
+        with self.reading() as index:
+            return index.connection.execute(statement, values).fetchall()
+
+    def seasons(self) -> list[SeasonRow]:
         return [SeasonRow(*row) for row in self._all(f"{_SEASONS} ORDER BY sequence")]
 
-    def row(self, name: str) -> SeasonRow | None:
+    def _find(self, name: str) -> SeasonRow | None:
         rows = self._all(f"{_SEASONS} WHERE digest = ?1 OR id = ?1", name)
         return SeasonRow(*rows[0]) if rows else None
 
-    def named(self, name: str) -> SeasonRow:
-        row = self.row(name)
+    def season_row(self, name: str) -> SeasonRow:
+        row = self._find(name)
         if row is None:
             raise Rejection(
                 "season_unknown",
@@ -97,280 +110,6 @@ class Seasons:
                 "its seasons.",
             )
         return row
-
-    def entrants(self, season: str) -> list[SealedRow]:
-        return self._sealed("track = ? ORDER BY number", season)
-
-    def entrant(self, id: str) -> SealedRow | None:
-        return next(iter(self._sealed("id = ? AND track <> ''", id)), None)
-
-    def ticket(self, season: str, number: int) -> SealedRow | None:
-        return next(iter(self._sealed("track = ? AND number = ?", season, number)), None)
-
-    def next_number(self, season: str) -> int:
-        return self._index.number("SELECT count(*) + 1 FROM entry WHERE track = ?", season)
-
-    def read(self, row: SeasonRow) -> Season:
-        return self._index.objects.document(Season, row.document)
-
-    def _season(self, entry: LogEntry) -> None:
-        season = self._index.read(Season, entry)
-        entry.check_subject(season.digest)
-        if self.row(season.digest) is not None or self.row(season.id) is not None:
-            raise entry.contradiction("announces a season twice")
-        values = {
-            "digest": entry.subject,
-            "sequence": entry.sequence,
-            "announced": entry.time,
-            "document": entry.document,
-            "kind": season.track,
-            "instances": sum(1 for _ in season.hidden),
-        }
-        values |= {name: getattr(season, name) for name in ("id", "title", "opens", "closes")}
-        self._index.insert("track", values)
-
-    def _admitted(self, entry: LogEntry) -> None:
-        admitted = self._index.read(Admitted, entry)
-        row = self.row(admitted.season)
-        if row is None or entry.subject != row.digest:
-            raise entry.contradiction("the season is unknown")
-        if row.reveal is not None:
-            raise _revealed(row)
-        if admitted.key in self.admitted(row.digest):
-            raise entry.contradiction("admits a key twice")
-        self._index.insert(
-            "admitted", {"track": row.digest, "key": admitted.key, "name": admitted.name}
-        )
-
-    def admitted(self, season: str) -> dict[str, str]:
-        """The names of the admitted keys of a season, by its digest."""
-        return dict(self._all("SELECT key, name FROM admitted WHERE track = ?", season))
-
-    def _entry(self, entry: LogEntry) -> None:
-        season, signed = self._signed(entry, "sealed-offline", Signed[Entry])
-        answers = signed.content.answers
-        if len(answers) != season.instances:
-            raise entry.contradiction("names more or fewer answers than there are instances")
-        given = [answer for answer in answers if answer is not None]
-        self._add(entry, season, signed.content, len(given), 0)
-        for answer in given:
-            self._index.name_artefact(answer, signed.content.submitter.key, entry)
-
-    def _ticket(self, entry: LogEntry) -> None:
-        row, signed = self._signed(entry, "sealed-online", Signed[TicketRequest])
-        season = self.read(row)
-        self._check_limits(season, signed.content.submitter.key)
-        self._add(entry, row, signed.content, row.instances, played_bytes(season))
-
-    def _signed(
-        self, entry: LogEntry, track: SealedTrack, kind: type[_Signed]
-    ) -> tuple[SeasonRow, _Signed]:
-        signed = self._index.read(kind, entry)
-        entry.check_subject(signed.id)
-        key = signed.content.submitter.key
-        return self.open(signed.content.season, track, key, entry.time), signed
-
-    def open(self, name: str, track: SealedTrack, key: str, time: str) -> SeasonRow:
-        """The season of this id or digest; a `Rejection` unless it is open to a key at a time."""
-        row = self.named(name)
-        if row.track != track:
-            raise Rejection(
-                "season_track",
-                f"season={row.id}: its track is {row.track}: must be {track}. Offline seasons take "
-                "entries, online ones start tickets.",
-            )
-        if row.reveal is not None:
-            raise _revealed(row)
-        if time < row.opens:
-            raise Rejection(
-                "season_not_open",
-                f"season={row.id}: opens at {row.opens}, and it is {time}. Come back then.",
-            )
-        if time >= row.closes:
-            raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
-        if self.read(row).admission == "listed" and key not in self.admitted(row.digest):
-            raise Rejection(
-                "not_admitted",
-                f"key={key[:16]}…: the organiser of the season {row.id} has not admitted it. Send "
-                "the public key to the organiser, who adds it with `sme-leaderboard season admit`.",
-            )
-        return row
-
-    def _check_limits(self, season: Season, key: str) -> None:
-        assert season.tickets is not None  # the track is online
-        assert season.tickets_per_key is not None
-        own = self._index.number(
-            "SELECT count(*) FROM entry WHERE track = ? AND key = ?", season.digest, key
-        )
-        if own >= season.tickets_per_key:
-            raise Rejection(
-                "ticket_limit",
-                f"key={key[:16]}…: has started {own} of {season.tickets_per_key} tickets of "
-                f"the season {season.id}. Every one of them counts.",
-            )
-        if self.next_number(season.digest) > season.tickets:
-            raise Rejection(
-                "ticket_limit",
-                f"season={season.id}: all of its {season.tickets} tickets were started. Ask the "
-                "board's owner for another season.",
-            )
-
-    def _add(
-        self, entry: LogEntry, row: SeasonRow, manifest: SealedManifest, policies: int, played: int
-    ) -> None:
-        key, name = manifest.submitter.key, manifest.submitter.name
-        self._index.add_entrant(
-            entry,
-            manifest,
-            status="entered",
-            track=row.digest,
-            number=self.next_number(row.digest),
-            created=manifest.created,
-            submitter=self.admitted(row.digest).get(key, name),
-            runs=row.instances,
-            policies=policies,
-            reserved=played,
-        )
-
-    def _result(self, entry: LogEntry) -> None:
-        row = self.entrant(entry.subject)
-        season = None if row is None else self.row(row.season)
-        if row is None or season is None or row.result is not None:
-            raise entry.contradiction("the entry or ticket is unknown, or has a result")
-        online = season.track == "sealed-online"
-        if online != (entry.event == "ended") or not (online or season.reveal):
-            raise entry.contradiction("of another track, or before the reveal")
-        result = self._index.read(SealedResult, entry)
-        entry.check_subject(result.subject)
-        sizes = len(result.runs), len(result.stepping)
-        if result.season != row.season or sizes != (season.instances, season.instances * online):
-            raise entry.contradiction("names a result of another season")
-        self._index.connection.execute(
-            "UPDATE entry SET status = 'scored', result = ?, finished = ?, policies = ?, "
-            "steps = ?, oracle_like = ?, scores = ?, reserved = ? WHERE id = ?",
-            (
-                *(entry.document, entry.time),
-                sum(run.artefact is not None for run in result.runs),
-                sum(each.steps for each in result.stepping),
-                *(result.oracle_like, result.scores.to_text()),
-                played_bytes(self.read(season), result) if online else 0,
-                entry.subject,
-            ),
-        )
-
-    def _revealed(self, entry: LogEntry) -> None:
-        row = self.row(entry.subject)
-        if row is None or row.digest != entry.subject:
-            raise entry.contradiction("the season is unknown")
-        reveal = self._index.read(Reveal, entry)
-        entry.check_subject(reveal.season)
-        master = Master(bytes.fromhex(reveal.master))
-        if not self.read(row).is_committed_to(master):
-            raise Rejection(
-                "reveal_mismatch",
-                f"master: does not match the commitment of the season {row.id}. Give the file "
-                "that `sme-leaderboard season new` wrote.",
-            )
-        if row.reveal is not None:
-            raise entry.contradiction("the season is already revealed")
-        for other in self.rows():  # whose tasks may follow from the same secret
-            if other.reveal is None and self.read(other).is_committed_to(master):
-                self._check_over(other, entry.time)
-        self._index.connection.execute(
-            "UPDATE track SET reveal = ?, revealed = ? WHERE digest = ?",
-            (entry.document, entry.time, entry.subject),
-        )
-
-    def _check_over(self, row: SeasonRow, time: str) -> None:
-        """Reject (`season_not_closed`) a reveal while entrants can still play."""
-        if time < row.closes:
-            raise Rejection(
-                "season_not_closed",
-                f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
-                "until then.",
-            )
-        running = [each.number for each in self.entrants(row.digest) if each.result is None]
-        if row.track == "sealed-online" and running:
-            raise Rejection(
-                "season_not_closed",
-                f"season={row.id}: {len(running)} tickets run, the first of them number "
-                f"{running[0]}. Serve the board until their deadlines have passed.",
-            )
-
-    def _sealed(self, where: str, *values: Any) -> list[SealedRow]:
-        return [_sealed(row) for row in self._all(f"{_SEALED} WHERE {where}", *values)]
-
-    def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
-        return self._index.connection.execute(statement, values).fetchall()
-
-
-_OF_SEASONS = {
-    "season": Seasons._season,
-    "admitted": Seasons._admitted,
-    "entry": Seasons._entry,
-    "ticket": Seasons._ticket,
-    "ended": Seasons._result,
-    "ranked": Seasons._result,
-    "revealed": Seasons._revealed,
-}
-
-
-def _revealed(row: SeasonRow) -> Rejection:
-    return Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
-
-
-def _apply(index: Index, entry: LogEntry) -> None:
-    _OF_SEASONS[entry.event](Seasons(index), entry)
-
-
-SEASON_KINDS: Kinds = {**KINDS, **dict.fromkeys(_OF_SEASONS, _apply)}
-
-_SEASONS = (
-    "SELECT digest, sequence, announced, document, id, title, kind, opens, closes, instances, "
-    "reveal, revealed FROM track"
-)
-_OF_ENTRANT = (
-    *("id", "sequence", "received", "method", "version", "family", "knowledge", "submitter", "key"),
-    *("code_link", "runs", "steps", "policies", "oracle_like", "scores"),
-)
-_SEALED = (
-    f"SELECT track, number, created, document, result, finished, {', '.join(_OF_ENTRANT)} "
-    "FROM entry"
-)
-
-
-def _sealed(row: tuple[Any, ...]) -> SealedRow:
-    season, number, created, document, result, finished, *rest = row
-    values = dict(zip(_OF_ENTRANT, rest, strict=True))
-    scores = values.pop("scores")
-    entrant = EntryRow(
-        **{**values, "oracle_like": bool(values["oracle_like"])},
-        status="waiting" if scores is None else "scored",
-        code="",
-        enough_runs=False,
-        reference=False,
-        scores=None if scores is None else Scores.from_text(scores),
-    )
-    return SealedRow(season, number, created, document, result, finished, entrant)
-
-
-class SeasonStore(Store):
-    """A board with seasons, each by its digest; `name` is its id or digest."""
-
-    kinds = SEASON_KINDS
-
-    @contextlib.contextmanager
-    def _reading(self) -> Iterator[Seasons]:
-        with self.reading() as index:
-            yield Seasons(index)
-
-    def seasons(self) -> list[SeasonRow]:
-        with self._reading() as seasons:
-            return seasons.rows()
-
-    def season_row(self, name: str) -> SeasonRow:
-        with self._reading() as seasons:
-            return seasons.named(name)
 
     def season(self, name: str) -> Season:
         return self.objects.document(Season, self.season_row(name).document)
@@ -380,27 +119,32 @@ class SeasonStore(Store):
         return self.folder.seasons / hex_of(digest)
 
     def admitted(self, season: str) -> dict[str, str]:
-        with self._reading() as seasons:
-            return seasons.admitted(season)
+        """The names of the admitted keys of a season, by its digest."""
+        return dict(self._all("SELECT key, name FROM admitted WHERE track = ?", season))
 
     def entrants(self, season: str) -> list[SealedRow]:
-        with self._reading() as seasons:
-            return seasons.entrants(season)
+        return self._sealed("track = ?", season)
 
     def entrant(self, id: str) -> SealedRow | None:
-        with self._reading() as seasons:
-            return seasons.entrant(id)
+        return next(iter(self._sealed("id = ? AND track <> ''", id)), None)
 
     def ticket(self, season: str, number: int) -> SealedRow:
-        with self._reading() as seasons:
-            row = seasons.ticket(season, number)
-        if row is None:
+        rows = self._sealed("track = ? AND number = ?", season, number)
+        if not rows:
             raise Rejection(
                 "ticket_unknown",
                 f"ticket={number}: the season has no ticket of this number. Start one with "
                 "`sme-leaderboard ticket`.",
             )
-        return row
+        return rows[0]
+
+    def _sealed(self, where: str, *values: Any) -> list[SealedRow]:
+        with self.reading() as index:
+            return list(index.entrants(SealedRow, where, *values))
+
+    def _next_number(self, season: str) -> int:
+        [(number,)] = self._all("SELECT count(*) + 1 FROM entry WHERE track = ?", season)
+        return int(number)
 
     def ticket_folder(self, season: str, number: int) -> Path:
         return self.season_folder(season) / "tickets" / str(number)
@@ -425,14 +169,10 @@ class SeasonStore(Store):
             )
         return Master(bytes.fromhex(self.objects.document(Reveal, row.reveal).master))
 
-    def open_season(self, name: str, track: SealedTrack, key: str) -> SeasonRow:
-        with self._reading() as seasons:
-            return seasons.open(name, track, key, self.clock.time)
-
     def announce(self, season: Season) -> bool:
         """False if the board already has it."""
-        with self.transaction() as index:
-            row = Seasons(index).row(season.id)
+        with self.transaction():
+            row = self._find(season.id)
             if row is not None:
                 if row.digest == season.digest:
                     return False
@@ -449,24 +189,22 @@ class SeasonStore(Store):
 
     def admit(self, season: str, key: str, name: str) -> bool:
         """Add a key to a season's list, under the name that pages show; False if it is on it."""
-        with self.transaction() as index:
+        with self.transaction():
             row = self.season_row(season)
             admitted = Admitted.from_dict({"season": row.digest, "key": key, "name": name})
-            if row.reveal is None and key in Seasons(index).admitted(row.digest):
+            if row.reveal is None and key in self.admitted(row.digest):
                 return False
             self.record("admitted", row.digest, admitted)
         return True
 
-    def add(
-        self, event: Literal["entry", "ticket"], signed: Signed[Entry] | Signed[TicketRequest]
-    ) -> tuple[int, bool]:
+    def add(self, signed: Signed[Entry] | Signed[TicketRequest]) -> tuple[int, bool]:
         """Add what was admitted to an open season: its number, and whether it is new."""
-        with self.transaction() as index:
-            known = Seasons(index).entrant(signed.id)
+        with self.transaction():
+            known = self.entrant(signed.id)
             if known is not None:
                 return known.number, False
-            number = Seasons(index).next_number(signed.content.season)
-            self.record(event, signed.id, signed)
+            number = self._next_number(signed.content.season)
+            self.record(signed.content.PURPOSE, signed.id, signed)
         return number, True
 
     def finish(self, result: SealedResult, not_before: str = "") -> bool:
@@ -474,8 +212,8 @@ class SeasonStore(Store):
 
         `not_before` is a ticket's deadline, unless its entrant has ended it.
         """
-        with self.transaction() as index:
-            row = Seasons(index).entrant(result.subject)
+        with self.transaction():
+            row = self.entrant(result.subject)
             if row is None:
                 raise BoardError(f"entry={result.subject}: is not on this board.")
             if self.clock.received() < not_before:
@@ -485,7 +223,7 @@ class SeasonStore(Store):
                 )
             if row.result is not None:
                 return False
-            online = self.season_row(row.season).track == "sealed-online"
+            online = self.season_row(row.track).kind == "sealed-online"
             self.record("ended" if online else "ranked", result.subject, result)
         return True
 
@@ -497,3 +235,193 @@ class SeasonStore(Store):
                 return False
             self.record("revealed", row.digest, reveal)
         return True
+
+    def _announced(self, entry: LogEntry) -> None:
+        season = self._connected.read(Season, entry)
+        entry.check_subject(season.digest)
+        if self._find(season.digest) or self._find(season.id):
+            raise entry.contradiction("announces a season twice")
+        values = {
+            "digest": entry.subject,
+            "sequence": entry.sequence,
+            "announced": entry.time,
+            "document": entry.document,
+            "kind": season.track,
+            "instances": sum(1 for _ in season.hidden),
+        }
+        values |= {name: getattr(season, name) for name in ("id", "title", "opens", "closes")}
+        self._connected.insert("track", values)
+
+    def _admitted(self, entry: LogEntry) -> None:
+        admitted = self._connected.read(Admitted, entry)
+        row = self._find(admitted.season)
+        if row is None or entry.subject != row.digest:
+            raise entry.contradiction("the season is unknown")
+        if row.reveal is not None:
+            raise _is_revealed(row)
+        if admitted.key in self.admitted(row.digest):
+            raise entry.contradiction("admits a key twice")
+        self._connected.insert(
+            "admitted", {"track": row.digest, "key": admitted.key, "name": admitted.name}
+        )
+
+    def _entered(self, entry: LogEntry) -> None:
+        season, signed = self._signed(entry, "sealed-offline", Signed[Entry])
+        answers = signed.content.answers
+        if len(answers) != season.instances:
+            raise Rejection(
+                "answer_missing",
+                f"answers: has {len(answers)}: must have {season.instances}, one for each instance "
+                f"of the season {season.id}, null where the method failed.",
+            )
+        given = [answer for answer in answers if answer is not None]
+        self._add(entry, season, signed.content, len(given), 0)
+        for answer in given:
+            self._connected.name_artefact(answer, signed.content.submitter.key, entry)
+
+    def _started(self, entry: LogEntry) -> None:
+        row, signed = self._signed(entry, "sealed-online", Signed[TicketRequest])
+        season = self.season(row.digest)
+        self._check_limits(season, signed.content.submitter.key)
+        self._add(entry, row, signed.content, row.instances, played_bytes(season))
+
+    def _signed(
+        self, entry: LogEntry, track: SealedTrack, kind: type[_Signed]
+    ) -> tuple[SeasonRow, _Signed]:
+        signed = self._connected.read(kind, entry)
+        entry.check_subject(signed.id)
+        key = signed.content.submitter.key
+        return self.open_season(signed.content.season, track, key, entry.time), signed
+
+    def open_season(self, name: str, track: SealedTrack, key: str, time: str) -> SeasonRow:
+        """The season of this id or digest; a `Rejection` unless it is open to a key at a time."""
+        row = self.season_row(name)
+        if row.kind != track:
+            raise Rejection(
+                "season_track",
+                f"season={row.id}: its track is {row.kind}: must be {track}. Offline seasons take "
+                "entries, online ones start tickets.",
+            )
+        if row.reveal is not None:
+            raise _is_revealed(row)
+        if time < row.opens:
+            raise Rejection(
+                "season_not_open",
+                f"season={row.id}: opens at {row.opens}, and it is {time}. Come back then.",
+            )
+        if time >= row.closes:
+            raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
+        if self.season(row.digest).admission == "listed" and key not in self.admitted(row.digest):
+            raise Rejection(
+                "not_admitted",
+                f"key={key[:16]}…: the organiser of the season {row.id} has not admitted it. Send "
+                "the public key to the organiser, who adds it with `sme-leaderboard season admit`.",
+            )
+        return row
+
+    def _check_limits(self, season: Season, key: str) -> None:
+        assert season.tickets is not None  # the track is online
+        assert season.tickets_per_key is not None
+        own = self._connected.number(
+            "SELECT count(*) FROM entry WHERE track = ? AND key = ?", season.digest, key
+        )
+        if own >= season.tickets_per_key:
+            raise Rejection(
+                "ticket_limit",
+                f"key={key[:16]}…: has started {own} of {season.tickets_per_key} tickets of "
+                f"the season {season.id}. Every one of them counts.",
+            )
+        if self._next_number(season.digest) > season.tickets:
+            raise Rejection(
+                "ticket_limit",
+                f"season={season.id}: all of its {season.tickets} tickets were started. Ask the "
+                "board's owner for another season.",
+            )
+
+    def _add(
+        self, entry: LogEntry, row: SeasonRow, manifest: SealedManifest, policies: int, played: int
+    ) -> None:
+        key, name = manifest.submitter.key, manifest.submitter.name
+        self._connected.add_entrant(
+            entry,
+            manifest,
+            track=row.digest,
+            number=self._next_number(row.digest),
+            created=manifest.created,
+            submitter=self.admitted(row.digest).get(key, name),
+            runs=row.instances,
+            policies=policies,
+            reserved=played,
+        )
+
+    def _finished(self, entry: LogEntry) -> None:
+        row = self.entrant(entry.subject)
+        if row is None or row.result is not None:
+            raise entry.contradiction("the entry or ticket is unknown, or has a result")
+        season = self.season_row(row.track)
+        online = season.kind == "sealed-online"
+        if online != (entry.event == "ended") or not (online or season.reveal):
+            raise entry.contradiction("of another track, or before the reveal")
+        result = self._connected.read(SealedResult, entry)
+        entry.check_subject(result.subject)
+        sizes = len(result.runs), len(result.stepping)
+        if result.season != row.track or sizes != (season.instances, season.instances * online):
+            raise entry.contradiction("names a result of another season")
+        self._connected.connection.execute(
+            "UPDATE entry SET status = 'scored', result = ?, finished = ?, policies = ?, "
+            "steps = ?, oracle_like = ?, scores = ?, reserved = ? WHERE id = ?",
+            (
+                *(entry.document, entry.time),
+                sum(run.artefact is not None for run in result.runs),
+                sum(each.steps for each in result.stepping),
+                *(result.oracle_like, result.scores.to_text()),
+                played_bytes(self.season(season.digest), result) if online else 0,
+                entry.subject,
+            ),
+        )
+
+    def _revealed(self, entry: LogEntry) -> None:
+        row = self._find(entry.subject)
+        if row is None or row.digest != entry.subject:
+            raise entry.contradiction("the season is unknown")
+        reveal = self._connected.read(Reveal, entry)
+        entry.check_subject(reveal.season)
+        master = Master(bytes.fromhex(reveal.master))
+        if not self.season(row.digest).is_committed_to(master):
+            raise Rejection(
+                "reveal_mismatch",
+                f"master: does not match the commitment of the season {row.id}. Give the file "
+                "that `sme-leaderboard season new` wrote.",
+            )
+        if row.reveal is not None:
+            raise entry.contradiction("the season is already revealed")
+        for other in self.seasons():  # whose tasks may follow from the same secret
+            if other.reveal is None and self.season(other.digest).is_committed_to(master):
+                self._check_over(other, entry.time)
+        self._connected.connection.execute(
+            "UPDATE track SET reveal = ?, revealed = ? WHERE digest = ?",
+            (entry.document, entry.time, entry.subject),
+        )
+
+    def _check_over(self, row: SeasonRow, time: str) -> None:
+        """Reject (`season_not_closed`) a reveal while entrants can still play."""
+        if time < row.closes:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
+                "until then.",
+            )
+        running = [each.number for each in self.entrants(row.digest) if each.result is None]
+        if row.kind == "sealed-online" and running:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: {len(running)} tickets run, the first of them number "
+                f"{running[0]}. Serve the board until their deadlines have passed.",
+            )
+
+
+def _is_revealed(row: SeasonRow) -> Rejection:
+    return Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
+
+
+_SEASONS = f"SELECT {', '.join(SeasonRow._fields)} FROM track"

@@ -57,7 +57,7 @@ from sme_registry.seasons.wire import StepFormat, TicketStatus
 def deadline(season: Season, row: SealedRow) -> str:
     """When a ticket of an online season ends at the latest."""
     assert season.ticket_hours is not None  # the track is online
-    started = datetime.datetime.fromisoformat(row.entrant.received)
+    started = datetime.datetime.fromisoformat(row.received)
     return utc(shifted(started, datetime.timedelta(hours=season.ticket_hours)))
 
 
@@ -65,7 +65,7 @@ class Ticket:
     """One ticket: it runs until the entrant ends it, or its deadline has passed."""
 
     def __init__(self, store: SeasonStore, season: Season, master: Master, row: SealedRow) -> None:
-        self.number, self.id = row.number, row.entrant.id
+        self.number, self.id = row.number, row.id
         self._season, self._master = season, master
         self._clock, self._queue = store.clock, store.queue
         self._request = request = store.request_of(row)
@@ -73,7 +73,7 @@ class Ticket:
         self._token = master.secret("token", place).hex()
         self.deadline = deadline(season, row)
         self._closed = row.result is not None
-        folder = store.ticket_folder(row.season, row.number)
+        folder = store.ticket_folder(row.track, row.number)
         self._end_path = folder / "end.json"
         self._hidden = tuple(season.hidden)
         self.instances = tuple(
@@ -114,11 +114,6 @@ class Ticket:
     def is_over(self, now: str) -> bool:
         """Whether nothing can change any more, at a time of the board."""
         return self._closed or now >= self.deadline or self._end_path.exists()
-
-    @property
-    def is_unplayed(self) -> bool:
-        """Whether the entrant has neither signed nor answered anything."""
-        return not any(each.is_played for each in self.instances)
 
     def check_running(self) -> None:
         """Raise `Rejection` (`ticket_ended`) if the ticket is over, or older than transcripts."""
@@ -212,10 +207,8 @@ class Ticket:
             each.release()
 
 
-def score_ticket(
-    store: SeasonStore, season: Season, ticket: Ticket, *, replay: bool = False
-) -> SealedResult:
-    """Score a ticket that is over from its snapshots and answers; or `replay` its journals, too."""
+def score_ticket(store: SeasonStore, season: Season, ticket: Ticket) -> SealedResult:
+    """Score a ticket that is over, from its journals and answers."""
     runs, stepping = [], []
     versions: dict[str, str] = {}
     draws, rules = store.document.draws, store.document.rules
@@ -226,7 +219,7 @@ def score_ticket(
             [(run, used)] = score_runs(ticket.hidden(number), [answered], rules)
             versions |= used
         runs.append(run)
-        stepping.append(instance.replayed() if replay else instance.stepping())
+        stepping.append(instance.stepping())
     result = sealed_result(season, ticket.id, runs, versions, draws, stepping, rules)
     return result.model_copy(update={"signed": ticket.end_digest})
 
@@ -267,7 +260,7 @@ class Sessions:
     def of_master(cls, store: SeasonStore, secret: str | os.PathLike[str]) -> list[Sessions]:
         """Those of each online season that is committed to the master in a file."""
         master = Master.read(secret)
-        online = [store.season(row.id) for row in store.seasons() if row.track == "sealed-online"]
+        online = [store.season(row.id) for row in store.seasons() if row.kind == "sealed-online"]
         found = [cls(store, each, master) for each in online if each.is_committed_to(master)]
         if not found:
             raise BoardError(
@@ -321,15 +314,14 @@ class Sessions:
         return over
 
     def attend(self) -> None:
-        """Sync the journals; end the tickets that nobody has played, and let others be scored."""
+        """Sync the journals, and let tickets that are over be scored."""
         try:
             self.sync()
             over = [self.ticket(number) for number in self.over()]
             for ticket in over:
                 ticket.close()
-            self._store.queue.add_jobs(each.id for each in over if not each.is_unplayed)
-            for ticket in [each for each in over if each.is_unplayed][:_AT_ONCE]:
-                finish_ticket(self._store, self.season, ticket)
+            if over:
+                self._store.queue.add_jobs(each.id for each in over)
         except Exception as error:  # the board is locked, or has no memory or files left
             # Nothing but the kind of an error is logged: its text may name what is hidden.
             _log.error("season: cannot be attended to: %s", type(error).__name__)
@@ -366,7 +358,6 @@ class Sessions:
 
 
 _SECONDS = 1.0
-_AT_ONCE = 100  # results of unplayed tickets, of a second
 _log = logging.getLogger(__name__)
 
 
@@ -395,7 +386,7 @@ class ScoreTicket:
         row = store.entrant(id)
         if row is None or row.result is not None:
             return
-        season = store.season(row.season)
+        season = store.season(row.track)
         masters = map(Master.read, self.secrets)
         master = next(each for each in masters if season.is_committed_to(each))
         finish_ticket(store, season, Ticket(store, season, master, row))
@@ -434,4 +425,4 @@ def start_ticket(
     size = len(signed.to_bytes()) + played_bytes(store.season(request.season))
     with store.transaction():  # no other entrant can take the name, or the room, in between
         check_entrant(store, request.submitter, size)
-        return store.add("ticket", signed)
+        return store.add(signed)

@@ -97,9 +97,9 @@ def _page(pages: Pages, store: SeasonStore, row: SeasonRow) -> str:
         reasons=REASONS,
         row=row,
         season=season,
-        online=row.track == "sealed-online",
+        online=row.kind == "sealed-online",
         settings=[setting_text(member.setting) for member in season.classes],
-        entrants=_entrants(store, row, {each.entrant.id for each in counting(store, season)}),
+        entrants=_entrants(store, row, {each.id for each in counting(store, season)}),
         rankings=rankings,
         keys=by_key(store, season),
         master=store.revealed_master(row.digest).raw.hex() if row.reveal else "",
@@ -114,7 +114,7 @@ def _entrants(store: SeasonStore, row: SeasonRow, counted: set[str]) -> list[dic
     return [
         {
             "row": each,
-            "counts": each.entrant.id in counted,  # else, a later one of its method replaces it
+            "counts": each.id in counted,  # else, a later one of its method replaces it
             "online_regret": regret,
             "curve": next(drawn) if curve else Markup(""),
         }
@@ -266,7 +266,7 @@ class SeasonRoutes:
             "id": row.id,
             "digest": row.digest,
             "title": row.title,
-            "track": row.track,
+            "track": row.kind,
             "opens": row.opens,
             "closes": row.closes,
             "revealed": row.revealed or None,
@@ -352,10 +352,10 @@ class SeasonRoutes:
         if found is not None:
             return found
         row = self._store.season_row(season)
-        if row.track != "sealed-online":
+        if row.kind != "sealed-online":
             raise Rejection(
                 "season_track",
-                f"season={row.id}: its track is {row.track}: it takes entries, and has no tickets.",
+                f"season={row.id}: its track is {row.kind}: it takes entries, and has no tickets.",
             )
         raise RequestError(
             "season_not_served", f"season={season}: {HTTP_CODES['season_not_served']}."

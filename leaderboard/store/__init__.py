@@ -13,7 +13,7 @@ import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from leaderboard.documents.board import (
     RULES,
@@ -25,7 +25,7 @@ from leaderboard.documents.result import EntryRow, Result
 from leaderboard.documents.signed import Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store.index import KINDS, Index, Kinds
+from leaderboard.store.index import Index, Kinds
 from leaderboard.store.log import (
     EMPTY,
     Clock,
@@ -48,8 +48,6 @@ _Model = TypeVar("_Model", bound=StrictModel)
 
 class Store:
     """A board's folder, opened by `create` or `open`; a context manager."""
-
-    kinds: ClassVar[Kinds] = KINDS  # of the log's entries, which those of further tracks extend
 
     def __init__(self, path: str | Path, *, read_only: bool) -> None:
         self.folder = Folder(path)
@@ -149,6 +147,11 @@ class Store:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def kinds(self) -> Kinds:
+        """What log entries of further tracks do to the index."""
+        return {}
+
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Block all writers for a short while; a writable store also blocks all readers."""
@@ -163,16 +166,20 @@ class Store:
             if self._in_transaction:
                 yield self._connected
                 return
-            with self._lock.hold(exclusive=True), self._explained():
-                index = self._connected
-                with index.transaction():
-                    self._catch_up(index)
-                    self._follow_clock(index)
-                    self._in_transaction = True
-                    try:
-                        yield index
-                    finally:
-                        self._in_transaction = False
+            with self._lock.hold(exclusive=True), self._explained(), self._writing() as index:
+                self._catch_up(index)
+                self._follow_clock(index)
+                yield index
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[Index]:
+        """Write into the index, which is not refreshed meanwhile."""
+        with self._connected.transaction():
+            self._in_transaction = True
+            try:
+                yield self._connected
+            finally:
+                self._in_transaction = False
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Index]:
@@ -272,7 +279,7 @@ class Store:
         index = self._connected
         if self._log.has(index.head.sequence + 1):
             if self.read_only:
-                with index.transaction():
+                with self._writing():
                     self._catch_up(index)
             else:
                 with self.transaction():
@@ -298,9 +305,9 @@ class Store:
                 if not rebuild and self._index.is_current:
                     self._refuse_lost_log(self._index.head)
                     return
-                with self._index.transaction():
-                    self._index.clear()
-                    self._catch_up(self._index)
+                with self._writing() as index:
+                    index.clear()
+                    self._catch_up(index)
 
     def _refuse_lost_log(self, head: Head) -> None:
         """Check that the log still has the index's last entry; an index is never ahead of it."""
@@ -382,12 +389,12 @@ class Store:
     def entries(self) -> list[EntryRow]:
         """All submissions, in the order in which they were received."""
         with self.reading() as index:
-            return index.entries()
+            return list(index.entrants(EntryRow))
 
     def entry(self, id: str) -> EntryRow | None:
         """One submission; None if there is no such submission."""
         with self.reading() as index:
-            return next(iter(index.entries(id)), None)
+            return next(index.entrants(EntryRow, "track = '' AND id = ?", id), None)
 
     @property
     def head(self) -> Head:
@@ -444,7 +451,7 @@ class Store:
         """
         keys = self._column(
             "SELECT key FROM entry WHERE lower(submitter) = lower(?) AND "
-            "(status IN ('entered', 'waiting') OR (scores IS NOT NULL AND policies > 0)) "
+            "(status = 'waiting' OR (scores IS NOT NULL AND policies > 0)) "
             "ORDER BY sequence LIMIT 1",
             name,
         )

@@ -2,7 +2,7 @@
 
 The tables `head`, `track`, `entry`, `run`, `object` and `artefact` are a function of the log alone,
 so a rebuilt index equals one that grew. `entry` has the entrants of all tracks, and `track` the
-tracks besides the open one; `KINDS` says what each kind of log entry does to them. `lease` and
+tracks besides the open one; `Kinds` are what each kind of log entry does to them. `lease` and
 `upload` are temporary state: the claims of scorers and the faults that ended them, and artefacts
 that no submission names yet. `clock` is how the machine's clock stood when the board was first
 served since the machine started.
@@ -19,8 +19,6 @@ import contextlib
 import functools
 import os
 import sqlite3
-import zlib
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -115,20 +113,18 @@ CREATE TABLE upload (
 ) STRICT, WITHOUT ROWID;
 CREATE TABLE clock (boot TEXT PRIMARY KEY, offset REAL NOT NULL) STRICT, WITHOUT ROWID;
 """
-VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # changes with the schema's text
 
 _Model = TypeVar("_Model", bound=StrictModel)
-Kinds = Mapping[str, "Callable[[Index, LogEntry], None]"]
-
-
-_COLUMNS = tuple(field.name for field in fields(EntryRow) if field.name != "alike")
+_Row = TypeVar("_Row", bound=EntryRow)
+Kinds = Mapping[str, Callable[[LogEntry], None]]
 _OF_LEASE = {"faults": "coalesce(faults, 0)", "fault": "coalesce(fault, '')"}
-_ROW = ", ".join(_OF_LEASE.get(name, f"entry.{name}") for name in _COLUMNS)
-_ROWS = f"SELECT {_ROW} FROM entry LEFT JOIN lease ON submission = id WHERE track = ''"
 
 
 class Index:
-    """A connection to a database with the schema's tables, of a board's document and objects."""
+    """A connection to a database with the schema's tables, of a board's document and objects.
+
+    `kinds` are those of the log's entries that further tracks add.
+    """
 
     def __init__(
         self,
@@ -138,7 +134,14 @@ class Index:
         kinds: Kinds,
     ) -> None:
         self.connection, self.objects, self.document = connection, objects, document
-        self._kinds = kinds
+        self._kinds: Kinds = {
+            "opened": self._opened,
+            "received": self._received,
+            "result": self._result,
+            "withdrawn": self._withdrawn,
+            "clock": self._clock,
+            **kinds,
+        }
         self._written: StrictModel | None = None
 
     @classmethod
@@ -167,8 +170,6 @@ class Index:
     @property
     def is_current(self) -> bool:
         """Whether it has exactly the tables of this version, and is of this board."""
-        if self.one("PRAGMA user_version") != (VERSION,):
-            return False
         if _definitions(self.connection) != _expected():
             return False
         return self.one("SELECT board FROM head") == (self.document.digest,)
@@ -183,7 +184,6 @@ class Index:
             execute(f'DROP {kind} "{name}"')
         for statement in SCHEMA.split(";"):
             execute(statement)
-        execute(f"PRAGMA user_version = {VERSION}")
         self.connection.executemany("INSERT INTO upload VALUES (?, ?, ?, ?)", uploads)
 
     @contextlib.contextmanager
@@ -214,7 +214,7 @@ class Index:
             raise entry.contradiction("is dated before the entry before it")
         self._written = document
         try:
-            self._kinds[entry.event](self, entry)
+            self._kinds[entry.event](entry)
         except Rejection as error:
             if document is not None:
                 raise
@@ -302,8 +302,8 @@ class Index:
             self.name_artefact(artefact, key, entry)
 
     def _result(self, entry: LogEntry) -> None:
-        row = self.one("SELECT status, sequence, reference FROM entry WHERE id = ?", entry.subject)
-        if row is None or row[0] != "waiting":
+        row = self.one("SELECT sequence, reference FROM entry WHERE id = ?", entry.subject)
+        if row is None or self.status(entry.subject) != "waiting":
             raise entry.contradiction("the submission was not waiting for a result")
         result = self.read(Result, entry)
         entry.check_subject(result.submission)
@@ -317,9 +317,10 @@ class Index:
                 entry.subject,
             ),
         )
-        if not row[2]:
+        sequence, is_reference = row
+        if not is_reference:
             for run in result.runs:
-                self._add_run(entry.subject, row[1], run)
+                self._add_run(entry.subject, sequence, run)
         self._end_lease(entry)
 
     def _withdrawn(self, entry: LogEntry) -> None:
@@ -388,37 +389,32 @@ class Index:
         row = self.one("SELECT status FROM entry WHERE id = ? AND track = ''", id)
         return None if row is None else row[0]
 
-    def entries(self, id: str | None = None) -> list[EntryRow]:
-        """All submissions, in the order in which they were received; or only that of an id."""
-        alike: dict[str, list[Copies]] = defaultdict(list)
-        for submission, *copies in self.connection.execute(
-            "SELECT run.submission, entry.id, entry.key, count(*) FROM run "
-            "JOIN entry ON entry.sequence = run.first "
-            "WHERE run.first IS NOT NULL AND (?1 IS NULL OR run.submission = ?1) "
-            "GROUP BY run.submission, run.first ORDER BY run.submission, run.first",
-            (id,),
-        ):
-            alike[submission].append(Copies(*copies))
-        rows = []
-        clauses = "ORDER BY sequence" if id is None else "AND id = ?"
-        for row in self.connection.execute(f"{_ROWS} {clauses}", (id,) if id else ()):
-            values = dict(zip(_COLUMNS, row, strict=True))
+    def entrants(self, kind: type[_Row], where: str = "track = ''", *values: Any) -> Iterator[_Row]:
+        """Rows of `entry` as a class that has its columns, in the order of the log."""
+        names = [field.name for field in fields(kind) if field.name != "alike"]
+        columns = ", ".join(_OF_LEASE.get(name, f"entry.{name}") for name in names)
+        rows = self.connection.execute(
+            f"SELECT {columns} FROM entry LEFT JOIN lease ON submission = id WHERE {where} "
+            "ORDER BY sequence",
+            values,
+        ).fetchall()
+        for row in rows:
+            facts = dict(zip(names, row, strict=True))
             for name in ("enough_runs", "oracle_like", "reference"):
-                values[name] = bool(values[name])
-            if values["scores"] is not None:
-                values["scores"] = Scores.from_text(values["scores"])
-            rows.append(EntryRow(**values, alike=tuple(alike.get(values["id"], ()))))
-        return rows
+                facts[name] = bool(facts[name])
+            if facts["scores"] is not None:
+                facts["scores"] = Scores.from_text(facts["scores"])
+            yield kind(**facts, alike=self._copies(facts["id"]))
 
-
-KINDS: Kinds = {
-    "opened": Index._opened,
-    "received": Index._received,
-    "result": Index._result,
-    "withdrawn": Index._withdrawn,
-    "clock": Index._clock,
-}
-"""Of log entries, on every board: what each does to the index."""
+    def _copies(self, submission: str) -> tuple[Copies, ...]:
+        """The earlier submissions with runs like those of one."""
+        rows = self.connection.execute(
+            "SELECT entry.id, entry.key, count(*) FROM run JOIN entry "
+            "ON entry.sequence = run.first WHERE run.first IS NOT NULL AND run.submission = ? "
+            "GROUP BY run.first ORDER BY run.first",
+            (submission,),
+        )
+        return tuple(Copies(*row) for row in rows)
 
 
 def _files_of(index: Path) -> list[Path]:

@@ -33,27 +33,28 @@ MAX_FAULT = 500
 _FREE = "(submission IS NULL OR boot <> ?1 OR expires <= ?2)"
 _HELD = "held AND boot = ?1 AND expires > ?2"
 _ENTRIES = "FROM entry LEFT JOIN lease ON submission = id"
+_WAITS = "status = 'waiting' AND track = ''"
 _LEASE = "SELECT id, coalesce(attempt, 0), coalesce(faults, 0), coalesce(fault, '')"
 _NEXT = f"""
-{_LEASE} {_ENTRIES} WHERE status = 'waiting' AND {_FREE} ORDER BY reference DESC,
+{_LEASE} {_ENTRIES} WHERE {_WAITS} AND {_FREE} ORDER BY reference DESC,
   key IN (SELECT key FROM lease JOIN entry ON id = submission WHERE held), sequence LIMIT 1
 """
 _NEXT_JOB = f"""
 {_LEASE} FROM job LEFT JOIN lease ON submission = id WHERE {_FREE} ORDER BY job.rowid LIMIT 1
 """
-_WAITING = """
+_WAITING = f"""
 SELECT id FROM (SELECT id, 2 AS rank, rowid AS at FROM job
-  UNION ALL SELECT id, reference, sequence FROM entry WHERE status = 'waiting')
+  UNION ALL SELECT id, reference, sequence FROM entry WHERE {_WAITS})
 ORDER BY rank DESC, at
 """
 
 Counted = Literal["waiting", "queued", "claimable", "claimed", "done", "faults"]
 _COUNTED: dict[Counted, str] = {
-    "waiting": "count(*) FROM entry WHERE status = 'waiting'",
-    "queued": f"count(*) {_ENTRIES} WHERE status = 'waiting' AND coalesce(faults, 0) = 0",
-    "claimable": f"count(*) {_ENTRIES} WHERE status = 'waiting' AND {_FREE}",
+    "waiting": f"count(*) FROM entry WHERE {_WAITS}",
+    "queued": f"count(*) {_ENTRIES} WHERE {_WAITS} AND coalesce(faults, 0) = 0",
+    "claimable": f"count(*) {_ENTRIES} WHERE {_WAITS} AND {_FREE}",
     "claimed": f"count(*) FROM lease WHERE {_HELD}",
-    "done": "count(*) FROM entry WHERE status NOT IN ('waiting', 'entered') AND track = ''",
+    "done": "count(*) FROM entry WHERE status <> 'waiting' AND track = ''",
     "faults": "coalesce(sum(faults), 0) FROM lease",
 }
 """Submissions without result or withdrawal, those of them that no fault has stopped, and those that

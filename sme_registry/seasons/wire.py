@@ -48,10 +48,10 @@ import random
 import re
 import ssl
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Generic, Literal, NamedTuple, TypeVar
 from urllib.parse import urlsplit
 from urllib.request import getproxies, proxy_bypass
 
@@ -93,25 +93,47 @@ _HEADER = re.compile(
 _Secret = Annotated[Hex, Field(repr=False)]
 
 
-class TicketClass(StrictModel):
+MAX_INSTANCES = 1000
+"""Of all classes: a ticket has a run on each."""
+
+
+class HiddenClass(StrictModel):
+    """One kind of hidden task.
+
+    Attributes:
+      setting: all of a spec but its seed.
+      instances: number of hidden tasks.
+    """
+
     name: Name
-    setting: Setting  # all of a spec but its seed
-    instances: Annotated[Integer, Field(ge=1, le=1000)]  # number of hidden tasks
+    setting: Setting
+    instances: Annotated[Integer, Field(ge=1, le=MAX_INSTANCES)]
+
+
+class TicketClass(HiddenClass):
     budget: Annotated[Integer, Field(ge=1)]  # steps on each instance, over all lanes
 
 
-def instance_name(class_name: str, instance: int) -> str:
-    """What files and commands call a hidden instance, such as `deep-0`; it counts from 0."""
-    return f"{class_name}-{instance}"
+_Class = TypeVar("_Class", bound=HiddenClass)
 
 
-class TicketPlace(NamedTuple):
-    member: TicketClass
+class Hidden(NamedTuple, Generic[_Class]):
+    """One hidden instance: its class and its number in it, from 0."""
+
+    member: _Class
     instance: int
 
     @property
     def name(self) -> str:
-        return instance_name(self.member.name, self.instance)
+        """What files and commands call it, such as `deep-0`."""
+        return f"{self.member.name}-{self.instance}"
+
+
+def instances_of(classes: Iterable[_Class]) -> Iterator[Hidden[_Class]]:
+    """Every hidden instance, class by class."""
+    for member in classes:
+        for instance in range(member.instances):
+            yield Hidden(member, instance)
 
 
 class Ticket(StrictModel):
@@ -137,7 +159,7 @@ class Ticket(StrictModel):
     token: _Secret
     deadline: Annotated[str, Field(max_length=40)]
     lanes: Annotated[Integer, Field(ge=1)]
-    classes: Annotated[TupleOf[TicketClass], Field(min_length=1, max_length=1000)]
+    classes: Annotated[TupleOf[TicketClass], Field(min_length=1, max_length=MAX_INSTANCES)]
     signer: Signer | None = None
     _path: Path | None = PrivateAttr(None)  # of its file
 
@@ -152,12 +174,10 @@ class Ticket(StrictModel):
         return self._path
 
     @property
-    def places(self) -> Iterator[TicketPlace]:
-        for member in self.classes:
-            for instance in range(member.instances):
-                yield TicketPlace(member, instance)
+    def places(self) -> Iterator[Hidden[TicketClass]]:
+        return instances_of(self.classes)
 
-    def place(self, instance: int) -> TicketPlace:
+    def place(self, instance: int) -> Hidden[TicketClass]:
         places = list(self.places)
         return places[integer_in("instance", instance, 0, len(places) - 1)]
 

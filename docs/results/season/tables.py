@@ -52,8 +52,8 @@ def results(store: SeasonStore, season: str) -> Iterator[tuple[str, SealedResult
     for row in counting(store, store.season(season)):
         result = store.sealed_result(row)
         if result is not None:
-            star = "*" if row.entrant.knowledge == "family" else ""
-            found.append((row.entrant.method + star, result))
+            star = "*" if row.knowledge == "family" else ""
+            found.append((row.method + star, result))
     return iter(sorted(found, key=lambda each: each[1].scores.wd_regret.value))
 
 
@@ -126,7 +126,7 @@ def main() -> None:
     with SeasonStore.open(arguments.board, read_only=True) as store:
         for row in store.seasons():
             print_tables(store, row.id)
-            if row.track == "sealed-online" and arguments.figure:
+            if row.kind == "sealed-online" and arguments.figure:
                 draw(store, row.id, arguments.figure)
 
 

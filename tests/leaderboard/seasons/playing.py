@@ -186,10 +186,10 @@ class Played:
         return is_new
 
 
-def scored(store, season, number, **options):
+def scored(store, season, number):
     """The result of a ticket."""
     ticket = Ticket(store, season, MASTER, store.ticket(season.digest, number))
-    return score_ticket(store, season, ticket, **options)
+    return score_ticket(store, season, ticket)
 
 
 def request(number, value=0.3, lanes=LANES):

@@ -8,7 +8,7 @@ from leaderboard.scoring.ranking import failed_run
 from leaderboard.scoring.verify import Findings
 from leaderboard.seasons.publication import verify_seasons
 from leaderboard.seasons.scoring import sealed_result
-from leaderboard.seasons.season import Entry, Master, Stepping, Terms, TicketRequest
+from leaderboard.seasons.season import Entry, Master, Season, Stepping, TicketRequest
 from sme_registry import EvaluationProtocol
 
 MASTER = Master(bytes(range(32)))
@@ -24,7 +24,7 @@ OPENS, CLOSES = moment(-1), moment(1)  # the same in every document of a run
 
 
 def tiny_terms(track="sealed-offline", instances=2, **fields):
-    """The terms of an open season of one class, with digests of nothing offline."""
+    """An open season of one class, without a master, and offline with digests of nothing."""
     online = track == "sealed-online"
     member = {"name": "deep", "setting": SETTING, "instances": instances}
     member |= {"budget": 64} if online else {"data": {"nu": 0.5, "transitions": 300}}
@@ -32,7 +32,7 @@ def tiny_terms(track="sealed-offline", instances=2, **fields):
         {"class_name": "deep", "instance": i, "data": NOTHING, "challenge": NOTHING}
         for i in range(instances)
     ]
-    return Terms.from_dict(
+    return Season.from_dict(
         {
             "id": track,
             "title": "Tiny",
@@ -46,6 +46,7 @@ def tiny_terms(track="sealed-offline", instances=2, **fields):
             "tickets": 100 if online else None,
             "tickets_per_key": 2 if online else None,
             "published": [] if online else published,
+            "commitment": NOTHING,
             **fields,
         }
     )

@@ -70,7 +70,7 @@ def test_an_entry_is_stored_once_with_its_answers(store, key, monkeypatch):
     assert not send(store, signed, GOOD)
     assert read == [GOOD]
     [row] = store.entrants(SEASON.digest)
-    assert (row.entrant.runs, row.entrant.policies) == (2, 2)
+    assert (row.runs, row.policies) == (2, 2)
     assert store.objects.read(sha256_of(GOOD)) == GOOD
     assert not store.is_public(sha256_of(GOOD))
 
@@ -124,7 +124,7 @@ def test_what_changes_between_the_check_and_the_record_is_checked_again(store, k
     def taken(*arguments):
         other = SigningKey.generate()
         name = {"name": f"Tester {key.public[:8]}", "key": other.public}
-        store.add("entry", signed_entry(store, SEASON, other, [None, None], submitter=name))
+        store.add(signed_entry(store, SEASON, other, [None, None], submitter=name))
         return check_answers(*arguments)
 
     check_answers = entries._check_answers
@@ -194,7 +194,7 @@ def test_entries_over_http_have_the_same_codes(store, key):
         assert [post(SEASON.id, signed.to_bytes()) for _ in range(2)] == [(201, ""), (200, "")]
         assert client.get(f"/api/objects/{digits}").status_code == 404  # nobody copies answers
     [row] = store.entrants(SEASON.digest)
-    assert (row.entrant.id, row.entrant.runs, row.entrant.policies) == (signed.id, 2, 1)
+    assert (row.id, row.runs, row.policies) == (signed.id, 2, 1)
 
 
 def test_the_largest_season_has_entries_that_can_be_sent(store, key):
@@ -218,14 +218,14 @@ def test_a_season_with_a_list_takes_listed_keys_under_their_listed_names(store, 
     request = signed_request(store, online, key)
     assert refused(store, entries[0]) == "not_admitted"
     with pytest.raises(Rejection, match=r"not_admitted: .* the organiser of the season tickets"):
-        store.add("ticket", request)
+        store.add(request)
     store.admit("listed", SigningKey.generate().public, "Another")
     assert refused(store, entries[0]) == "not_admitted"
     assert store.admit("listed", key.public, "A Lab")
     assert send(store, entries[0])
-    assert [row.entrant.submitter for row in store.entrants(offline.digest)] == ["A Lab"]
+    assert [row.submitter for row in store.entrants(offline.digest)] == ["A Lab"]
     with pytest.raises(Rejection, match="not_admitted"):  # each season has its own list
-        store.add("ticket", request)
+        store.add(request)
     store.reindex()
     assert store.admitted(offline.digest)[key.public] == "A Lab"
     assert verify(store.folder.path, board=SeasonStore).log_sequence == store.head.sequence

@@ -7,7 +7,9 @@ import httpx
 import pytest
 
 from leaderboard.cli.submit import KEY_VARIABLE
+from leaderboard.scoring.worker import Work, beside, run_scorer
 from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.tickets import ScoreTicket
 from leaderboard.seasons.web import SeasonRoutes
 from leaderboard.store.log import to_bytes
 from tests.leaderboard.clocks import set_clocks
@@ -30,7 +32,13 @@ def board(tmp_path, monkeypatch):
 
 @contextlib.contextmanager
 def served(board):
-    with serving(board.path, season_secrets=[board.secret]) as url:
+    """A server and a scorer, by threads of this process, whose clocks are set."""
+    work = Work(False, ScoreTicket((board.secret,)), SeasonStore)
+
+    def score(stop):
+        run_scorer(board.path, work=work, until_empty=False, stop=stop.is_set)
+
+    with beside("scorer", score), serving(board.path, season_secrets=[board.secret]) as url:
         httpx.get(f"{url}/healthz", trust_env=False)  # it has started
         yield url
 
@@ -126,7 +134,7 @@ def test_a_ticket_that_a_wrong_clock_has_ended_stays_ended_and_its_season_verifi
     board, key, monkeypatch
 ):
     with SeasonStore.open(board.path) as store:
-        store.add("ticket", signed_request(store, board.season, key))
+        store.add(signed_request(store, board.season, key))
     set_clocks(monkeypatch, forward=MONTH)
     with served(board):
         assert "ended" in events(board, 20, "ended")

@@ -177,7 +177,7 @@ def test_an_entry_is_sent_to_a_served_board(season):
     assert counts("verify", "small")["autumn: data sets"] == (0, 2)
     assert counts("verify", "copy")["files by their digests"] == (2, 1)  # answers are secret
     with SeasonStore.open("board", read_only=True) as store:
-        assert [row.entrant.id for row in store.entrants(read_season(season).digest)] == [id]
+        assert [row.id for row in store.entrants(read_season(season).digest)] == [id]
 
 
 def test_keys_are_admitted_to_a_season_with_a_list():

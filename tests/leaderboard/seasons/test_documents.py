@@ -9,7 +9,7 @@ import pytest
 import rfc8785
 
 from leaderboard.errors import BoardError
-from leaderboard.seasons.season import Master, Place, Purpose, Reveal, Season, Terms
+from leaderboard.seasons.season import PLANNED, Master, Place, Purpose, Reveal, Season
 from sme_registry import SMESpec
 from sme_registry.errors import SpecError
 
@@ -31,6 +31,7 @@ def online(**fields):
         "ticket_hours": 24,
         "tickets": 100,
         "tickets_per_key": 3,
+        "commitment": PLANNED,
         **fields,
     }
 
@@ -51,13 +52,14 @@ def offline(**fields):
 
 @pytest.mark.parametrize("track", [online, offline])
 def test_a_season_is_committed_to_its_master_and_to_every_term(track):
-    terms = Terms.from_dict(track(versions={"numpy": "2.0.0"}))
-    season = terms.commit(MASTER)
-    message = b"sme-seal/1" + MASTER.raw + rfc8785.dumps(terms.to_dict())
+    season = Season.from_dict(track(versions={"numpy": "2.0.0"})).commit(MASTER)
+    terms = season.to_dict()
+    del terms["commitment"]
+    message = b"sme-seal/1" + MASTER.raw + rfc8785.dumps(terms)
     assert season.commitment == "sha256:" + hashlib.sha256(message).hexdigest()
     assert Season.from_dict(season.to_dict()) == season
-    assert set(terms.to_dict()) == set(Terms.model_fields) - {"admission"}
-    assert repr(terms.to_dict()["ticket_hours"]) in ("24", "None")  # as in earlier files
+    assert set(terms) == set(Season.model_fields) - {"admission", "commitment"}
+    assert repr(terms["ticket_hours"]) in ("24", "None")  # as in earlier files
     assert season.is_committed_to(MASTER)
     assert not season.is_committed_to(Master(bytes(32)))
     last = "1" if season.commitment[-1] == "0" else "0"
@@ -124,7 +126,7 @@ def online_class(**fields):
 
 
 def test_a_reveal_has_32_bytes():
-    digest = Terms.from_dict(online()).commit(MASTER).digest
+    digest = Season.from_dict(online()).commit(MASTER).digest
     for master in ("0" * 63, "G" * 64):
         with pytest.raises(SpecError, match="64 hex digits"):
             Reveal.from_dict({"season": digest, "master": master})
@@ -158,4 +160,4 @@ def test_a_reveal_has_32_bytes():
 )
 def test_terms_that_do_not_fit_are_refused(fields, message):
     with pytest.raises(SpecError, match=message):
-        Terms.from_dict(fields)
+        Season.from_dict(fields)

@@ -37,8 +37,8 @@ def play(store, key, move):
     put_submission(store, key)
     assert store.announce(offline)
     assert store.announce(online)
-    assert store.add("entry", entry) == (1, True)
-    assert store.add("ticket", request) == (1, True)
+    assert store.add(entry) == (1, True)
+    assert store.add(request) == (1, True)
     assert store.finish(failed_result(online, request.id))
     move()
     for season in (offline, online):
@@ -59,10 +59,10 @@ def test_a_season_is_played_from_its_announcement_to_its_results_and_reindexed(s
     for season in (offline, online):
         [row] = store.entrants(season.digest)
         assert row.number == 1
-        assert row.entrant.status == "scored"
-        assert row.entrant.scores is not None
-        assert row.entrant.scores.wd_regret.value == 1.0
-        assert store.sealed_result(row) == failed_result(season, row.entrant.id)
+        assert row.status == "scored"
+        assert row.scores is not None
+        assert row.scores.wd_regret.value == 1.0
+        assert store.sealed_result(row) == failed_result(season, row.id)
         assert store.revealed_master(season.id) == MASTER
     assert store.entry_of(store.entrants(offline.digest)[0]).is_valid(store.document.key)
     assert store.request_of(store.ticket(online.digest, 1)).is_valid(store.document.key)
@@ -81,10 +81,10 @@ def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
     season = tiny_season(ONLINE)
     store.announce(season)
     first = signed_request(store, season, key, 1)
-    assert [store.add("ticket", first) for _ in range(2)] == [(1, True), (1, False)]
-    assert store.add("ticket", signed_request(store, season, key, 2)) == (2, True)
+    assert [store.add(first) for _ in range(2)] == [(1, True), (1, False)]
+    assert store.add(signed_request(store, season, key, 2)) == (2, True)
     other = SigningKey.generate()
-    assert store.add("ticket", signed_request(store, season, other, 3)) == (3, True)
+    assert store.add(signed_request(store, season, other, 3)) == (3, True)
     result = failed_result(season, first.id)
     assert store.finish(result)
     assert not store.finish(result)
@@ -96,8 +96,8 @@ def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
 def test_the_clock_decides_and_no_earlier_clock_reopens(store, key, track, monkeypatch):
     def attempt(season):
         if track == OFFLINE:
-            return store.add("entry", signed_entry(store, season, key, [None, None]))
-        return store.add("ticket", signed_request(store, season, key))
+            return store.add(signed_entry(store, season, key, [None, None]))
+        return store.add(signed_request(store, season, key))
 
     with pytest.raises(Rejection, match="season_unknown"):
         attempt(tiny_season(track))
@@ -123,7 +123,7 @@ def test_a_reveal_follows_the_close_and_the_tickets_and_matches(store, key, late
     season = tiny_season(ONLINE)
     store.announce(season)
     request = signed_request(store, season, key)
-    store.add("ticket", request)
+    store.add(request)
     with pytest.raises(Rejection, match="reveal_mismatch"):
         store.reveal(reveal(season, Master(bytes(32))))
     with pytest.raises(Rejection, match="season_not_closed: season=sealed-online: closes at"):
@@ -137,7 +137,7 @@ def test_a_reveal_follows_the_close_and_the_tickets_and_matches(store, key, late
     assert store.reveal(reveal(season))
     assert not store.reveal(reveal(season))
     with pytest.raises(Rejection, match="season_revealed"):
-        store.add("ticket", signed_request(store, season, key, 2))
+        store.add(signed_request(store, season, key, 2))
     with pytest.raises(Rejection, match="season_revealed"):
         store.admit(season.id, key.public, "A Lab")
 
@@ -158,9 +158,9 @@ def test_what_is_allowed_and_what_is_logged_are_of_the_same_moment(store, key, l
     store.announce(season)
     real = Clock.received
     monkeypatch.setattr(Clock, "received", lambda clock: (real(clock), later())[0])
-    store.add("entry", signed_entry(store, season, key, [None, None]))
+    store.add(signed_entry(store, season, key, [None, None]))
     [row] = store.entrants(season.digest)
-    assert row.entrant.received < season.closes
+    assert row.received < season.closes
 
 
 @pytest.mark.parametrize("track", [OFFLINE, ONLINE])
@@ -172,7 +172,7 @@ def test_what_the_board_forged_or_was_signed_for_another_is_named(store, tmp_pat
         forged = {store: signed.model_copy(update={"signature": "0" * 128}), other: signed}
         for board, each in forged.items():
             board.announce(season)
-            board.add("entry" if track == OFFLINE else "ticket", each)
+            board.add(each)
             with pytest.raises(TamperedError, match="does not match the entrant's key"):
                 replayed(board)
 
@@ -225,18 +225,18 @@ def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path, key
         assert call > 3
         return SeasonStore.open(tmp_path / "board", read_only=True)
 
-    with after_every_death(lambda store: store.add("entry", entry)) as store:
-        assert [row.entrant.id for row in store.entrants(season.digest)] == [entry.id]
-    with after_every_death(lambda store: store.add("ticket", request)) as store:
+    with after_every_death(lambda store: store.add(entry)) as store:
+        assert [row.id for row in store.entrants(season.digest)] == [entry.id]
+    with after_every_death(lambda store: store.add(request)) as store:
         assert [row.number for row in store.entrants(online.digest)] == [1]
     with SeasonStore.open(tmp_path / "board") as store:
-        assert store.add("ticket", other) == (2, True)
-        assert store.add("ticket", request) == (1, False)
+        assert store.add(other) == (2, True)
+        assert store.add(request) == (1, False)
         for each in (request, other):
             store.finish(failed_result(online, each.id))
     later()
     with after_every_death(lambda store: store.reveal(reveal(season))) as store:
         assert store.revealed_master(season.id) == MASTER
     with after_every_death(lambda store: store.finish(failed_result(season, entry.id))) as store:
-        assert [row.entrant.status for row in store.entrants(season.digest)] == ["scored"]
+        assert [row.status for row in store.entrants(season.digest)] == ["scored"]
     verify(tmp_path / "board", board=SeasonStore)

@@ -155,17 +155,17 @@ START = (SPEC, 5, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
 def measured(actions, budget):
-    """The regret of actions `[requests, L, A]`, of which a snapshot is taken on the way."""
+    """The regret of actions `[requests, L, A]`; what goes on from a snapshot answers alike."""
     lanes = actions.shape[1]
     form = StepFormat(lanes, SPEC.state_dim, SPEC.action_dim)
-    play = Play(*START, lanes, budget)
+    play, other = (Play(*START, lanes, budget) for _ in range(2))
     for number, each in enumerate(actions, start=1):
-        play.take(form.pack(number, each))
-        if number == len(actions) // 2:
-            arrays = np.load(io.BytesIO(play.snapshot()), allow_pickle=False)
-            play = Play(*START, lanes, budget)
-            play.restore(arrays)
-    play.sign()
+        answer = play.take(form.pack(number, each))
+        if number > len(actions) // 2:
+            assert other.take(form.pack(number, each)) == answer
+            assert other.head == play.head
+        elif number == len(actions) // 2:
+            other.restore(np.load(io.BytesIO(play.snapshot()), allow_pickle=False))
     return play.stepping
 
 

@@ -32,7 +32,7 @@ def board(tmp_path_factory):
             store.announce(tiny_season("sealed-online", id=name, **fields))
         store.announce(tiny_season("sealed-offline"))
         ada = {"name": "Ada", "key": OTHER.public}
-        store.add("ticket", board.request(OTHER, submitter=ada))
+        store.add(board.request(OTHER, submitter=ada))
     return board
 
 
@@ -104,7 +104,7 @@ def test_a_season_that_is_open_and_a_key_have_only_so_many_tickets(url, board, k
 def test_tickets_count_towards_the_quota_of_a_day(tmp_path, key):
     board = online_board(tmp_path, limits={"submissions_per_day": 1})
     with SeasonStore.open(board.path) as store:
-        store.add("ticket", board.request(key))
+        store.add(board.request(key))
         envelope = Signed[TicketRequest].read(board.request(key, 1).to_bytes())
         with pytest.raises(Rejection, match="quota"):
             start_ticket(store, envelope)
@@ -156,7 +156,7 @@ def test_the_ranking_grows_as_tickets_end(url, board, key):
     address = f"{url}/api/seasons/ranked/ranking"
     with SeasonStore.open(board.path) as store:
         store.announce(season)
-        store.add("ticket", ranked.request(key))
+        store.add(ranked.request(key))
         empty = httpx.get(address).json()
         store.finish(scored(store, season, 1))
     grown = httpx.get(address, params={"metric": "ood_regret"}).json()

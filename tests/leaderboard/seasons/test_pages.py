@@ -33,7 +33,7 @@ def result(season, subject):
 def entry(store, key, knowledge="generic", note=""):
     method = {"name": f"Mine {knowledge}", "version": "1", "family": "x", "knowledge": knowledge}
     signed = signed_entry(store, OFFLINE, key, [None, None], method=method, statement=note)
-    store.add("entry", signed)
+    store.add(signed)
     return signed.id
 
 
@@ -82,7 +82,7 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
 def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key):
     board.announce(ONLINE)
     request = signed_request(board, ONLINE, key)
-    board.add("ticket", request)
+    board.add(request)
     running = page(board, "seasons/winter.html")
     assert "running" in running.words
     assert request.content.nonce not in running.words
@@ -106,7 +106,7 @@ def test_a_season_is_shown_before_the_boards_reference_rows_but_not_its_scores(
         admission.submit_references(board)
         board.announce(ONLINE)
         request = signed_request(board, ONLINE, key)
-        board.add("ticket", request)
+        board.add(request)
         assert "running" in page(board, "seasons/winter.html", address="http://board.test").words
         board.finish(result(ONLINE, request.id))
         prepares = page(board, "seasons/winter.html", address="http://board.test")
@@ -120,7 +120,7 @@ def test_the_site_of_a_board_with_seasons_is_well_formed_and_its_links_work(boar
     board.announce(OFFLINE)
     board.announce(ONLINE)
     entry(board, key)
-    board.add("ticket", signed_request(board, ONLINE, key))
+    board.add(signed_request(board, ONLINE, key))
     site = write_site(board, tmp_path / "site", sections=[SECTION]).parent
     pages = {
         path.relative_to(site).as_posix(): Page(path.read_text()) for path in site.rglob("*.html")

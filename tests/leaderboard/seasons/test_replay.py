@@ -114,9 +114,12 @@ def test_what_an_organiser_replaces_before_the_result_is_found(tmp_path, monkeyp
         played.finish()
         played.answer(np.full((ROWS, 1), 0.5))
         move_clock(monkeypatch)
-        replace(played.folder)
-        played.score()
         season = played.board.season
+        result = scored(played.store, season, 1)
+        replace(played.folder)
+        with pytest.raises(TamperedError, match="is not the entrant's"):
+            played.score()
+        played.store.finish(result)
         played.store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
         with pytest.raises(TamperedError, match=r"tickets/1/0\.json: is not the entrant's"):
             replayed(played.store)
@@ -239,7 +242,7 @@ def test_no_log_has_an_early_reveal_or_goes_back_in_time(tmp_path):
 def test_a_ticket_that_ended_early_without_all_answers_is_found(tmp_path, monkeypatch, key):
     board = online_board(tmp_path)
     with SeasonStore.open(board.path) as store:
-        store.add("ticket", signed_request(store, board.season, key))
+        store.add(signed_request(store, board.season, key))
         store.finish(scored(store, board.season, 1))
         logged(monkeypatch, AFTERWARDS, store, *reveal(board))
         with pytest.raises(TamperedError, match="without all answers: must not be before"):
