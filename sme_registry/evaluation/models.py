@@ -16,7 +16,7 @@ import json
 import os
 import sys
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,14 +48,6 @@ class Interface(NamedTuple):
                     f"{self.description}. Evaluate it on the task that it was trained or prepared "
                     "for."
                 )
-
-
-class ModelFunctions(NamedTuple):
-    """How a model acts: fields of `Policy`."""
-
-    act: Act
-    episodes: Callable[[], Act] | None = None
-    hidden: Callable[[Observation], Iterable[Any] | None] | None = None
 
 
 # PyTorch
@@ -95,9 +87,10 @@ class ModulePredictor:
         return returned
 
 
-def of_module(module: Any) -> ModelFunctions:
+def of_module(module: Any) -> dict[str, Any]:
+    """How a module acts: fields of `Policy`."""
     act = ModulePredictor(module)
-    return ModelFunctions(act, hidden=_hidden_layers(act, module))
+    return {"act": act, "hidden": _hidden_layers(act, module)}
 
 
 def _hidden_layers(act: Act, module: Any) -> Callable[[Observation], list[Any] | None]:
@@ -179,8 +172,8 @@ def evaluating(module: Any) -> Iterator[None]:
 # Stable-Baselines3 and what has its interface
 
 
-def of_sb3(model: Any, interface: Interface) -> ModelFunctions:
-    """A model's deterministic actions; those of a plain SB3 model before they are clipped."""
+def of_sb3(model: Any, interface: Interface) -> dict[str, Any]:
+    """How a model acts: fields of `Policy`; a plain SB3 model before its actions are clipped."""
     spaces = {"observations": "observation_space", "actions": "action_space"}
     shapes = {what: getattr(getattr(model, s, None), "shape", None) for what, s in spaces.items()}
     interface.check("policy", **shapes)
@@ -194,7 +187,7 @@ def of_sb3(model: Any, interface: Interface) -> ModelFunctions:
     network = torch_policy(model)
     if network is None:
         begin = functools.partial(_stateful, model)
-        return ModelFunctions(lambda observations: begin()(observations), begin)
+        return {"act": lambda observations: begin()(observations), "episodes": begin}
 
     def act(observations: Observation) -> Any:
         torch = _torch()
@@ -203,7 +196,7 @@ def of_sb3(model: Any, interface: Interface) -> ModelFunctions:
             chosen = network._predict(batch, deterministic=True).cpu().numpy()
         return network.unscale_action(chosen) if network.squash_output else chosen
 
-    return ModelFunctions(act, hidden=_hidden_layers(act, network))
+    return {"act": act, "hidden": _hidden_layers(act, network)}
 
 
 def torch_policy(model: Any) -> Any:

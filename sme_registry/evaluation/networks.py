@@ -33,29 +33,13 @@ _MAX_LAYERS = 64
 _MAX_BYTES = 2**28
 
 
-def _silu(x: Weights, out: Weights) -> None:
-    out *= 1.0 / (1.0 + np.exp(-x))
-
-
-def _sigmoid(x: Weights, out: Weights) -> None:
-    out[:] = 1.0 / (1.0 + np.exp(-x))
-
-
-def _relu(x: Weights, out: Weights) -> None:
-    np.maximum(x, 0.0, out=out)
-
-
-def _elu(x: Weights, out: Weights) -> None:
-    out[:] = np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))
-
-
-ACTIVATIONS: dict[str, Callable[..., Any]] = {
-    "identity": lambda x, out: None,
-    "relu": _relu,
+ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
+    "identity": lambda x: x,
+    "relu": lambda x: np.maximum(x, 0.0),
     "tanh": np.tanh,
-    "sigmoid": _sigmoid,
-    "silu": _silu,
-    "elu": _elu,
+    "sigmoid": lambda x: 1.0 / (1.0 + np.exp(-x)),
+    "silu": lambda x: x * (1.0 / (1.0 + np.exp(-x))),
+    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
 }
 
 
@@ -123,7 +107,7 @@ class Perceptron:
         for W, b, activation in self.layers:
             x = x @ W
             x += b
-            ACTIVATIONS[activation](x, out=x)
+            x = ACTIVATIONS[activation](x)
             yield x
 
     def hidden(self, observations: Observation) -> list[Weights]:

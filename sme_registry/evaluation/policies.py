@@ -27,7 +27,7 @@ from sme_registry.errors import (
     did_you_mean,
 )
 from sme_registry.evaluation import models
-from sme_registry.evaluation.models import Interface, ModelFunctions, load_onnx, load_sb3
+from sme_registry.evaluation.models import Interface, load_onnx, load_sb3
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.references import OLD_NAMES, POLICIES, reference_policy
 from sme_registry.io import choice, import_object
@@ -208,7 +208,11 @@ def as_policy(
         policy, default = _named(policy, spec)
         name = name or default
     if algorithm is not None:
-        policy, name = _of_algorithm(policy, algorithm), name or Path(policy).stem
+        if not isinstance(policy, os.PathLike) or Path(policy).suffix != ".zip":
+            raise PolicyError(
+                f"algorithm={algorithm!r}: is for the path of a model's .zip. Leave it out."
+            )
+        policy, name = load_sb3(policy, algorithm), name or Path(policy).stem
     if isinstance(policy, TeamPolicy):
         policy.check_team(spec)
         return policy if name is None else replace(policy, name=name)
@@ -273,14 +277,6 @@ def _named(text: str, spec: SMESpec) -> tuple[Any, str]:
     return function, text
 
 
-def _of_algorithm(policy: Any, algorithm: str) -> Any:
-    if not isinstance(policy, os.PathLike) or Path(policy).suffix != ".zip":
-        raise PolicyError(
-            f"algorithm={algorithm!r}: is for the path of a model's .zip. Leave it out."
-        )
-    return load_sb3(policy, algorithm)
-
-
 def _of_agents(folder: Path, spec: SMESpec) -> dict[str, Path]:
     """The policies in a folder by agent: `<agent>.zip`, `.onnx` or `.npz`."""
     files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in _SUFFIXES}
@@ -304,6 +300,7 @@ def _prepare(
     if isinstance(policy, os.PathLike):
         name = name or Path(policy).stem
         policy = _load(Path(policy), interface)
+    functions: dict[str, Any]
     if hasattr(policy, "predict"):
         functions = models.of_sb3(policy, interface)
         action_range = action_range or models.action_range_of(policy)
@@ -312,9 +309,9 @@ def _prepare(
     elif isinstance(policy, Perceptron):
         shapes = {"observations": (policy.observation_dim,), "actions": (policy.action_dim,)}
         interface.check(f"policy {name or _name_of(policy)!r}", **shapes)
-        functions = ModelFunctions(policy, hidden=policy.hidden)
+        functions = {"act": policy, "hidden": policy.hidden}
     elif callable(policy):
-        functions = ModelFunctions(policy)
+        functions = {"act": policy}
     else:
         raise PolicyError(
             f"policy={policy!r:.80}: must be a callable from observations "
@@ -327,9 +324,7 @@ def _prepare(
         action_range=action_range or getattr(policy, "action_range", None) or "unit",
         action_dim=interface.action_dim,
         hint=interface.hint,
-        act=functions.act,
-        episodes=functions.episodes,
-        hidden=functions.hidden,
+        **functions,
     )
 
 

@@ -249,12 +249,6 @@ class Returns(NamedTuple):
     finite: Array
     left: Array  # γ^(T − t), 0 of episodes that D ends before
 
-    @classmethod
-    def of(cls, runs: Rollouts, steps: npt.NDArray[np.int64], gamma: float) -> Returns:
-        """Those of episodes that had so many `steps` to go."""
-        ended = runs.length < steps
-        return cls(runs.discounted_return, np.where(ended, 0.0, gamma**steps))
-
 
 def expected_returns(
     task: Task,
@@ -268,15 +262,12 @@ def expected_returns(
     **begun: Array | None,
 ) -> Returns:
     """`values` of checked arguments; `begun` are r_cum, distractors and first actions."""
-    runs = (
-        Returns.of(
-            rollouts(policy, task, s, t=t, gamma=gamma, seed=seed + i, **begun),
-            task.spec.horizon - t,
-            gamma,
-        )
-        for i in range(samples)
-    )
-    return Returns(*(np.mean(parts, axis=0) for parts in zip(*runs, strict=True)))
+    finite, left, steps = [], [], task.spec.horizon - t
+    for i in range(samples):
+        runs = rollouts(policy, task, s, t=t, gamma=gamma, seed=seed + i, **begun)
+        finite.append(runs.discounted_return)
+        left.append(np.where(runs.length < steps, 0.0, gamma**steps))
+    return Returns(np.mean(finite, axis=0), np.mean(left, axis=0))
 
 
 def _has_formula(spec: SMESpec, gamma: float) -> bool:
