@@ -53,7 +53,6 @@ _MIN_STATES, _MAX_STATES = 256, 50_000
 _TEST_STATES = 4096
 _BATCH, _LEARNING_RATE = 256, 3e-3  # the rate decays to 0 along a cosine
 _EXPLORATION_STATES, _EXPLORATION_SAMPLES = 256, 16  # samples of the action in each state
-_PROGRESS = 1000  # gradient steps
 _DORMANT = 0.025  # τ of the score
 _SATURATED = 0.95  # mean |h| of a unit of tanh
 _RANK_SHARE = 0.99  # 1 − δ of the singular values' sum
@@ -172,17 +171,12 @@ class Trajectories(NamedTuple):
 
 
 def rollout(
-    act: Callable[[Observation], Array],
-    task: Task,
-    initial_states: Array,
-    seed: int,
-    *,
-    sees_state: bool = False,
+    act: Callable[[Any, Observation], Array], task: Task, initial_states: Array, seed: int
 ) -> tuple[Trajectories, ...]:
     """Whole episodes of a policy in the unit range, from initial states `[n, S]`, by agent.
 
-    `act` maps the joint observations `[n, O]`, or float32 states `[n, S]` if it `sees_state`, to
-    the actions `[n, A]` of all agents. `seed` is of the distractors.
+    `act` maps float32 states `[n, S]` and joint observations `[n, O]` to the actions `[n, A]` of
+    all agents. `seed` is of the distractors.
     """
     n, agents = len(initial_states), len(task.owned)
     batch = Batch(task, n)
@@ -192,7 +186,7 @@ def rollout(
     batch.begin(np.arange(n), batch.observe(), initial_states)
 
     def actions(s: Array, observation: Observation) -> Array:
-        return np.clip(act(s.astype(np.float32) if sees_state else observation.copy()), 0.0, 1.0)
+        return np.clip(act(s.astype(np.float32), observation.copy()), 0.0, 1.0)
 
     columns = batch.schedule.columns.numbers
     on_top = [columns[name] for name in ON_TOP if name in columns]
@@ -233,9 +227,16 @@ def episodes_of(
     S, T = task.spec.state_dim, task.spec.horizon
     n = max(8, min(episodes, MAX_NUMBERS // (T * (S + 8))))
     starts = draw.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)
-    runs = {POLICY: rollout(act, task, starts, seed)}
-    for name, reference in _reference_actions(task, fitted, n, seed).items():
-        runs[name] = rollout(reference, task, starts, seed, sees_state=True)
+    random, shape = Uniform(seed, "diagnosis/random_action"), (n, task.spec.action_dim)
+
+    def reference(name: str, s: Any, _: Observation) -> Array:
+        known = references.Knowledge(task, s, lambda: fitted, random)
+        return np.broadcast_to(references.REFERENCES[name].act(known), shape)
+
+    names = (LINEAR, *CONSTANTS, "random")
+    actors: dict[str, Callable[[Any, Observation], Array]] = {POLICY: lambda _, seen: act(seen)}
+    actors |= {name: functools.partial(reference, name) for name in names}
+    runs = {name: rollout(actor, task, starts, seed) for name, actor in actors.items()}
     return tuple(dict(zip(runs, agent, strict=True)) for agent in zip(*runs.values(), strict=True))
 
 
@@ -261,20 +262,6 @@ def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
         state_shift=tuple(_distance_from_uniform(values) for values in visited.T),
         coverage=min(_coverage(values) for values in visited.T),
     )
-
-
-def _reference_actions(
-    task: Task, fitted: references.References, n: int, seed: int
-) -> dict[str, Callable[[Observation], Array]]:
-    """References as functions of states `[n, S]`."""
-    random, shape = Uniform(seed, "diagnosis/random_action"), (n, task.spec.action_dim)
-
-    def act(name: str, s: Any) -> Array:
-        known = references.Knowledge(task, s, lambda: fitted, random)
-        return np.broadcast_to(references.REFERENCES[name].act(known), shape)
-
-    names = (LINEAR, *CONSTANTS, "random")
-    return {name: functools.partial(act, name) for name in names}
 
 
 def _reward_signal(task: Task, run: Trajectories) -> RewardSignal:
@@ -365,9 +352,7 @@ def exploration_sd(
     return tuple(np.sqrt(sampled.var(axis=0, ddof=1).mean(axis=0)).tolist())
 
 
-def probe_capacity(
-    network: Perceptron, task: Task, states: int, seed: int, progress: Callable[[int], None]
-) -> CapacityProbe:
+def probe_capacity(network: Perceptron, task: Task, states: int, seed: int) -> CapacityProbe:
     require_packages("probe_capacity", {"torch": "PyTorch"}, "train")
     import torch
 
@@ -378,7 +363,7 @@ def probe_capacity(
     constant_mae = float(np.abs(0.5 - optimal[count:]).mean())
     with _torch_seed(seed):
         module = _module(network)
-        _fit(module, observation[:count], optimal[:count], seed, progress)
+        _fit(module, observation[:count], optimal[:count], seed)
 
         def normalised_regret(states: slice) -> float:
             with torch.no_grad():
@@ -396,28 +381,20 @@ def probe_capacity(
         )
 
 
-def _fit(
-    module: Any,
-    observation: Observation,
-    optimal: Observation,
-    seed: int,
-    progress: Callable[[int], None],
-) -> None:
+def _fit(module: Any, observation: Observation, optimal: Observation, seed: int) -> None:
     import torch
 
     optimiser = torch.optim.Adam(module.parameters(), lr=_LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, GRADIENT_STEPS)
     inputs, targets = torch.from_numpy(observation), torch.from_numpy(optimal)
     order = np.random.default_rng(seed)
-    for step in range(GRADIENT_STEPS):
+    for _ in range(GRADIENT_STEPS):
         batch = torch.from_numpy(order.integers(0, len(inputs), _BATCH))
         loss = torch.nn.functional.mse_loss(module(inputs[batch]), targets[batch])
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
-        if (step + 1) % _PROGRESS == 0:
-            progress(step + 1)
 
 
 def _module(network: Perceptron) -> Any:

@@ -13,11 +13,6 @@ CRITIC: Questions = {}
 _about = partial(add_to, CRITIC, "why", needs="critic")
 
 
-def _critic_of(run: TaskDiagnosis) -> CriticReport:
-    assert run.measurements.critic is not None  # the questions are asked only then
-    return run.measurements.critic
-
-
 def _without_ranking(report: CriticReport) -> Decision:
     return Decision("critic_of_states" if report.kind == "V" else "rewards_alike", {})
 
@@ -28,8 +23,7 @@ def _without_ranking(report: CriticReport) -> Decision:
     unclear="rewards_alike",
     thresholds="ranks_well ranks_badly actor_lags",
 )
-def _critic_ranking(run: TaskDiagnosis) -> Decision:
-    report = _critic_of(run)
+def _critic_ranking(run: TaskDiagnosis, report: CriticReport) -> Decision:
     ranking = report.region(VISITED).ranking
     if ranking is None:
         return _without_ranking(report)
@@ -48,8 +42,7 @@ def _critic_ranking(run: TaskDiagnosis) -> Decision:
     unclear="rewards_alike",
     thresholds="ranks_well ranks_badly",
 )
-def _critic_outside(run: TaskDiagnosis) -> Decision:
-    report = _critic_of(run)
+def _critic_outside(_run: TaskDiagnosis, report: CriticReport) -> Decision:
     inside, outside = report.region("WD"), report.regions[-1]
     if inside.ranking is None or outside.ranking is None:
         return _without_ranking(report)
@@ -63,16 +56,11 @@ def _critic_outside(run: TaskDiagnosis) -> Decision:
     unclear="neither_learnt",
     thresholds="ranks_well ranks_badly",
 )
-def _discount(run: TaskDiagnosis) -> Decision:
-    report = _critic_of(run)
+def _discount(_run: TaskDiagnosis, report: CriticReport) -> Decision:
     cube = report.region("WD")
     if cube.misled_ranking is None or cube.ranking is None:
         return Decision("nothing_misleads", {})
-    evidence = {
-        "ranking": cube.ranking,
-        "misled_ranking": cube.misled_ranking,
-        "gamma": report.gamma,
-    }
+    evidence = {**cube.model_dump(include={"ranking", "misled_ranking"}), "gamma": report.gamma}
     if _badly(cube.ranking) and not _well(cube.misled_ranking):
         return Decision("neither_learnt", evidence)
     return Decision(_badly(cube.ranking), evidence)
@@ -92,8 +80,7 @@ def _badly(ranking: float) -> bool:
     unclear="level_biased level_of_data",
     thresholds="level_bias maturity",
 )
-def _critic_level(run: TaskDiagnosis) -> Decision:
-    report = _critic_of(run)
+def _critic_level(_run: TaskDiagnosis, report: CriticReport) -> Decision:
     cube = report.region("WD")
     if cube.bias_share is None:
         return Decision("level_of_data", {})

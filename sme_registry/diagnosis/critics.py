@@ -10,7 +10,7 @@ Source: METHOD, section 11. A critic is compared with the policy that its target
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -57,13 +57,13 @@ class CriticRegion(StrictModel):
 
     region: str
     states: Integer
-    ranking: Real | None
-    misled_ranking: Real | None
-    claim: Real | None
-    finite: Real | None
-    continuing: Real | None
-    bias: Real | None
-    bias_share: Real | None
+    ranking: Real | None = None
+    misled_ranking: Real | None = None
+    claim: Real | None = None
+    finite: Real | None = None
+    continuing: Real | None = None
+    bias: Real | None = None
+    bias_share: Real | None = None
 
 
 class CriticTime(StrictModel):
@@ -227,21 +227,13 @@ class _Critic:
         return action
 
 
-def critic(
-    model: Any,
-    task: SpecLike | Task,
-    *,
-    kind: Literal["V", "Q"] | None = None,
-    states: int = 500,
-    seed: int = 0,
-) -> CriticReport:
+def critic(model: Any, task: SpecLike | Task, *, states: int = 500, seed: int = 0) -> CriticReport:
     """Compare the critic of a Stable-Baselines3 model with the exact values of its policy.
 
     Args:
       model: PPO, TD3, SAC or DDPG, as a model or the path of its .zip (which can run code of its
         author), as `sme train` writes it for agents in JAX too; or the folder of an offline
         training with IQL, of which only the ranking is known.
-      kind: "V" or "Q", to be sure of it; by default what the model has.
       states: of each region.
       seed: of states, of noise and of sampled actions.
 
@@ -253,7 +245,7 @@ def critic(
     """
     task = single_agent(task if isinstance(task, Task) else load_task(task))
     integer_in("states", states, 1)
-    learnt = _critic_of(model, task, kind, seed)
+    learnt = _critic_of(model, task, seed)
     protocol = EvaluationProtocol(states_per_region=states, seed=seed)
     points = {VISITED: _visited(task, learnt, states, seed)} | {
         regions.region_name(region): _drawn(task, protocol, region)
@@ -281,7 +273,7 @@ def ranking_in_cube(model: Any, task: Task, states: int, seed: int) -> float | N
     """The ranking of a model's critic in the cube alone; None where `critic` has none."""
     if not has_critic(model, task):
         return None
-    learnt = _critic_of(model, task, None, seed)
+    learnt = _critic_of(model, task, seed)
     if learnt.kind == "V":
         return None
     protocol = EvaluationProtocol(states_per_region=states, seed=seed)
@@ -304,29 +296,24 @@ def _is_read(model: Any) -> bool:
     return any(hasattr(model.policy, critic) for critic in ("predict_values", "critic"))
 
 
-def _critic_of(model: Any, task: Task, kind: str | None, seed: int) -> _Critic | OfflineAgent:
-    found: _Critic | OfflineAgent | None = OfflineAgent.of(model)
-    if found is None:
-        learnt = load_sb3(model) if isinstance(model, str | Path) else model
-        if not _is_read(learnt):
+def _critic_of(model: Any, task: Task, seed: int) -> _Critic | OfflineAgent:
+    learnt: _Critic | OfflineAgent | None = OfflineAgent.of(model)
+    if learnt is None:
+        model = load_sb3(model) if isinstance(model, str | Path) else model
+        if not _is_read(model):
             raise PolicyError(
-                f"model: {type(learnt).__name__} has no critic that is known here. Give a PPO, "
+                f"model: {type(model).__name__} has no critic that is known here. Give a PPO, "
                 "A2C, TD3, SAC or DDPG of Stable-Baselines3, or its .zip; or the folder of an "
                 "offline training with IQL."
             )
-        found = _Critic(learnt, seed)
-    seen, expected = found.observation_shape, (task.spec.observation_dim,)
+        learnt = _Critic(model, seed)
+    seen, expected = learnt.observation_shape, (task.spec.observation_dim,)
     if seen != expected:
         raise PolicyError(
             f"model: its observations have shape {seen}, and this task's {expected}. Give the task "
             "that it was trained on; of a stream with an observed phase, critics are not compared."
         )
-    if kind not in (None, found.kind):
-        raise PolicyError(
-            f"kind={kind!r}: {found.name} has a critic of {found.kind}, not of {kind}. Leave kind "
-            "out."
-        )
-    return found
+    return learnt
 
 
 def _to_unit(symmetric: Any) -> Array:
@@ -369,6 +356,10 @@ class _Levels(NamedTuple):
     def estimated(self) -> Array:
         return self.finite if self.continuing is None else self.continuing
 
+    def means(self, rows: Any = ...) -> dict[str, Any]:
+        levels = self._asdict().items()
+        return {name: None if of is None else float(of[rows].mean()) for name, of in levels}
+
     @classmethod
     def of(cls, task: Task, learnt: _Critic, at: _Points, tail: float | None, seed: int) -> _Levels:
         mode = learnt.mode(at.observation)
@@ -388,42 +379,22 @@ def _region(
     levels: _Levels | None,
     seed: int,
 ) -> CriticRegion:
-    ranking, misled = _rankings(task, learnt, at, seed) if learnt.kind == "Q" else (None, None)
-    return CriticRegion(
-        region=name,
-        states=len(at.s),
-        ranking=ranking,
-        misled_ranking=misled,
-        **_means(levels),
-    )
+    fields: dict[str, Any] = {}
+    if learnt.kind == "Q":
+        fields["ranking"], fields["misled_ranking"] = _rankings(task, learnt, at, seed)
+    if levels is not None:
+        bias = float((levels.claim - levels.estimated).mean())
+        share = bias / max(abs(float(levels.estimated.mean())), 1e-9)
+        fields |= {**levels.means(), "bias": bias, "bias_share": share}
+    return CriticRegion(region=name, states=len(at.s), **fields)
 
 
-def _means(levels: _Levels | None) -> dict[str, float | None]:
-    if levels is None:
-        return dict.fromkeys(("claim", "finite", "continuing", "bias", "bias_share"))
-    bias = float((levels.claim - levels.estimated).mean())
-    return {
-        "claim": float(levels.claim.mean()),
-        "finite": float(levels.finite.mean()),
-        "continuing": None if levels.continuing is None else float(levels.continuing.mean()),
-        "bias": bias,
-        "bias_share": bias / max(abs(float(levels.estimated.mean())), 1e-9),
-    }
-
-
-def _times(task: Task, at: _Points, levels: _Levels) -> list[CriticTime]:
+def _times(task: Task, at: _Points, levels: _Levels) -> Iterator[CriticTime]:
     part = at.t * _TIMES // task.spec.horizon
-    rows = []
-    for chosen in (np.flatnonzero(part == i) for i in range(_TIMES)):
-        if chosen.size:
-            claim, finite, continuing = (
-                None if level is None else float(level[chosen].mean()) for level in levels
-            )
-            assert claim is not None
-            assert finite is not None
+    for chosen in (part == i for i in range(_TIMES)):
+        if chosen.any():
             time = float(at.t[chosen].mean() / task.spec.horizon)
-            rows.append(CriticTime(time=time, claim=claim, finite=finite, continuing=continuing))
-    return rows
+            yield CriticTime(time=time, **levels.means(chosen))
 
 
 def _rankings(

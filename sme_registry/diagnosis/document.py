@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
-from pydantic import Field, JsonValue, model_validator
+from pydantic import JsonValue
 from rich.console import RenderableType
 from rich.constrain import Constrain
 from rich.markup import escape
@@ -50,7 +50,6 @@ from sme_registry.diagnosis.subject import AnySubject
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.references import LABELS, beside_safety
 from sme_registry.evaluation.regions import ObservationReport
-from sme_registry.evaluation.report import NEW_NAMES, renamed
 from sme_registry.io import choice, versions
 from sme_registry.io.markup import Table, fixed, percent, plural
 from sme_registry.spec import SMESpec, StreamSpec, catalogue
@@ -65,7 +64,6 @@ from sme_registry.spec.document import (
 
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
 
-_NEW_NAMES = {**NEW_NAMES, "sensitivity": "steepness"}
 _ANSWERS = ("question", "answer", "evidence")  # columns of a part in words
 _HEADINGS = {
     "who": "Who is not to blame",
@@ -144,24 +142,16 @@ class Diagnosis(DigestedFile):
     documents = ("spec",)
     remedy = "Diagnose the run again."
 
-    schema_version: Annotated[
-        Literal[3], Field(description="Version of the document's format; 1 and 2 are read as well.")
-    ] = 3
+    schema_version: Literal[3] = 3
     name: str
-    task: str = ""
+    task: str
     plan: dict[str, JsonValue]
-    checkpoint_step: Integer | None = None
+    checkpoint_step: Integer | None
     seeds: Integer = 1
-    updates: Integer | None = None
+    updates: Integer | None
     verdicts: TupleOf[Verdict]
     thresholds: dict[str, Real]
     versions: dict[str, str]
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_version_2(cls, data: Any) -> Any:
-        is_old = isinstance(data, dict) and data.get("schema_version") in (1, 2)
-        return renamed(data, _NEW_NAMES) | {"schema_version": 3} if is_old else data
 
     @classmethod
     def about(cls, subject: AnySubject, **fields: Any) -> Self:
@@ -243,7 +233,7 @@ class Diagnosis(DigestedFile):
         """Findings first, on request the other answers, then the tables of its kind."""
         yield self.findings("Findings", self.verdicts)
         yield from self.answers(self.verdicts)
-        yield from (part for part in self.tables() if part.rows)
+        yield from (part for part in self.tables() if part.rows or part.notes)
 
     @abstractmethod
     def tables(self) -> Iterator[Part]:
@@ -392,11 +382,8 @@ class TaskDiagnosis(Diagnosis):
 
     def judged(self, questions: Questions) -> Self:
         """This diagnosis with the answers to those of the questions that its task has."""
-        asked = {
-            name: question
-            for name, question in questions.items()
-            if not question.needs or getattr(self.measurements, question.needs) is not None
-        }
+        unknown = {name for name, value in self.measurements if value is None}
+        asked = {name: q for name, q in questions.items() if not unknown.intersection(q.needs)}
         return super().judged(asked)
 
     def tables(self) -> Iterator[Part]:

@@ -1,6 +1,6 @@
 """The figures of a diagnosis: by channel, state and time; of a team by agent; of a life by visit.
 
-`sme evaluate` draws limits, distractors and layers, and what a life retains.
+`sme evaluate` draws the shells, limits, distractors and layers, and what a life retains.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from sme_registry.diagnosis.behaviour import CONSTANTS
 from sme_registry.diagnosis.critics import CriticReport
 from sme_registry.diagnosis.document import Diagnosis, TaskDiagnosis
-from sme_registry.diagnosis.measure import LINEAR, POLICY
+from sme_registry.diagnosis.measure import LINEAR
 from sme_registry.diagnosis.stream import StreamDiagnosis
 from sme_registry.diagnosis.task import TeamDiagnosis
 from sme_registry.evaluation.references import LABELS
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_REFERENCES = (LINEAR, "best_constant", "constant", "random")
 _MOST = 32  # channels or agents in one panel
 _FRESH = "fresh agent of the phase"
 _REGRET = "normalised regret  (0 = optimal)"
@@ -118,7 +118,7 @@ def _channels(diagnosis: TaskDiagnosis, figure: Figure) -> None:
 
 def _states(diagnosis: TaskDiagnosis, figure: Figure) -> None:
     measured, threshold = diagnosis.measurements, diagnosis.thresholds["explained_variance"]
-    left, middle, right = figure.subplots(1, 3)
+    left, right = figure.subplots(1, 2)
     centre, *channels = measured.partitions
     best = sorted(channels, key=lambda p: -p.explained_variance)[:2]
     parts = {"distance": centre, **{f"s{p.state_channel}": p for p in best}}
@@ -129,29 +129,17 @@ def _states(diagnosis: TaskDiagnosis, figure: Figure) -> None:
     left.axhline(threshold, color=GREY, linewidth=1.1, label=f"stands out above {threshold:.0%}")
     fifths = 1 + np.arange(len(centre.mae))
     names = ["distance from the centre", *(f"state channel {p.state_channel}" for p in best)]
-    _lines(middle, fifths, {name: p.mae for name, p in zip(names, parts.values(), strict=True)})
+    _lines(right, fifths, {name: p.mae for name, p in zip(names, parts.values(), strict=True)})
     left.set(
         xlabel="quantity that explains it",
         ylabel="share of the error's\nvariance explained",
         ylim=(0.0, max(0.12, left.get_ylim()[1])),
     )
-    _reference(middle, measured.uniform[LINEAR].mae, LINEAR)
-    middle.set(
-        xlabel="fifth of the states, by quantity",
-        ylabel="error, mean |a − a*|",
-        xticks=fifths,
+    _reference(right, measured.uniform[LINEAR].mae, LINEAR)
+    right.set(
+        xlabel="fifth of the states, by quantity", ylabel="error, mean |a − a*|", xticks=fifths
     )
-    levels = [shell.epsilon for shell in measured.shells]
-    regrets = {
-        name: [shell.scores[name].normalised_regret for shell in measured.shells]
-        for name in (POLICY, *_REFERENCES)
-    }
-    _lines(right, levels, {diagnosis.name: regrets.pop(POLICY)})
-    for name, values in regrets.items():
-        draw_reference(right, name, levels, values, LABELS[name])
-    right.set_xticks(levels, ["WD", *(f"{level:g}" for level in levels[1:])])
-    right.set(xlabel="expansion level ε of the shell", ylabel="normalised regret")
-    _legends(left, middle, right)
+    _legends(left, right)
 
 
 def _time(diagnosis: TaskDiagnosis, figure: Figure) -> None:
@@ -163,7 +151,7 @@ def _time(diagnosis: TaskDiagnosis, figure: Figure) -> None:
     if min(episodes.alive) < 1.0:
         series["share of episodes running"] = episodes.alive
     _lines(left, middles, series)
-    for name in _REFERENCES[:3]:
+    for name in (LINEAR, *CONSTANTS):
         _reference(left, episodes.scores[name].regret, name)
     over = f"mean over {episodes.episodes} episodes\n(grey: regret of references)"
     left.set(xlabel="step of the episode", ylabel=over)

@@ -12,6 +12,7 @@ actions over the distractors. Of a random policy, what averaging removes with d 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -271,10 +272,13 @@ def channels(task: Task, states: Sample) -> tuple[Channel, ...]:
         "at_one": (a >= 1.0 - _BOUND).mean(axis=0),
         "optimal_at_bounds": _at_bound(optimal).mean(axis=0),
     }
-    return tuple(
-        Channel(channel=i + 1, **{name: float(column[i]) for name, column in columns.items()})
-        for i in range(task.spec.action_dim)
-    )
+    return tuple(Channel(**row) for row in _rows(columns))
+
+
+def _rows(columns: dict[str, Array]) -> Iterator[dict[str, Any]]:
+    """The numbers of each action channel, by name."""
+    for channel, row in enumerate(np.transpose([*columns.values()]).tolist(), start=1):
+        yield {"channel": channel, **dict(zip(columns, row, strict=True))}
 
 
 def _slopes(states: Sample) -> Array:
@@ -315,15 +319,12 @@ def shells(
     policy: Policy, task: Task, fitted: references.References, seed: int, wd: dict[str, Score]
 ) -> tuple[Shell, ...]:
     """The cube, whose scores the caller has, and the five shells around it."""
-    count = affordable(task, _SHELL_STATES)
-
-    def scores_in(region: int) -> dict[str, Score]:
-        return scores(task, sample(policy, task, fitted, count, seed, region)) if region else wd
-
-    return tuple(
-        Shell(region=regions.region_name(region), epsilon=epsilon, scores=scores_in(region))
-        for region, (_, epsilon) in enumerate(EvaluationProtocol().edges)
-    )
+    count, measured = affordable(task, _SHELL_STATES), []
+    for region, (_, epsilon) in enumerate(EvaluationProtocol().edges):
+        if region > 0:
+            wd = scores(task, sample(policy, task, fitted, count, seed, region))
+        measured.append(Shell(region=regions.region_name(region), epsilon=epsilon, scores=wd))
+    return tuple(measured)
 
 
 def squared_error(policy: Policy, task: Task, states: Sample, time_variance: float) -> SquaredError:
@@ -430,24 +431,19 @@ def limits(
     """What a policy does to the limits, in uniform states and in those of its episodes."""
     assert task.spec.safety is not None  # it is measured only then
     limit, tightest = task.limit(states.s), 2.0 * task.spec.safety.tightness
-    above = [a - limit for a in (states.a, states.optimal)]
-    violating, optimal = ((excess > TOLERANCE).mean(axis=0) for excess in above)
-    cost = np.maximum(0.0, above[0]).mean(axis=0) / tightest
+    above, optimal_above = (a - limit for a in (states.a, states.optimal))
+    columns: dict[str, Array] = {
+        "violating_share": (above > TOLERANCE).mean(axis=0),
+        "optimal_violating_share": (optimal_above > TOLERANCE).mean(axis=0),
+        "cost": np.maximum(0.0, above).mean(axis=0) / tightest,
+    }
     s, a = visited
     cut_off = np.minimum(states.a, limit)
     return Violations(
         report=report,
         visited=_score(task, "visited", a, engine(task).optimal_action(s), task.limit(s)),
         cut_off=_score(task, "WD", cut_off, states.optimal, limit),
-        channels=tuple(
-            LimitedChannel(
-                channel=i + 1,
-                violating_share=float(violating[i]),
-                optimal_violating_share=float(optimal[i]),
-                cost=float(cost[i]),
-            )
-            for i in range(task.spec.action_dim)
-        ),
+        channels=tuple(LimitedChannel(**row) for row in _rows(columns)),
     )
 
 

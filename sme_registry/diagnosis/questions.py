@@ -155,8 +155,7 @@ class Verdict(StrictModel):
         """What a reason says, then the numbers."""
         if plain := words("plain", reason):
             return plain
-        thresholds = THRESHOLDS | self.thresholds  # older documents have fewer
-        numbers = words(macro or self.question, reason, self.evidence, thresholds)
+        numbers = words(macro or self.question, reason, self.evidence, self.thresholds)
         return f"{words('phrase', reason)} {numbers}".strip()
 
 
@@ -252,15 +251,15 @@ class Question(NamedTuple):
     """A question: its kind, its rule, and the answer that each reason gives."""
 
     kind: Kind
-    rule: Callable[[Any], Decision]  # of a diagnosis that has no verdicts yet
+    rule: Callable[..., Decision]  # of a diagnosis without verdicts, and what it `needs` measured
     thresholds: tuple[str, ...]  # that decide on its answer
     reasons: dict[str, Answer]
-    needs: str = ""  # the field of `Measurements` without which it is not asked
+    needs: tuple[str, ...] = ()  # fields of `Measurements` without which it is not asked
     is_cause: bool = False  # whether "yes" names a cause, which a run can leave open
 
     def decide(self, diagnosis: Any) -> Decision:
         """What the rule decides, with its reason by name."""
-        decision = self.rule(diagnosis)
+        decision = self.rule(diagnosis, *(getattr(diagnosis.measurements, n) for n in self.needs))
         if isinstance(decision.reason, str):
             return decision
         answer = "yes" if decision.reason else "no"
@@ -269,7 +268,7 @@ class Question(NamedTuple):
 
 
 Questions = dict[str, Question]
-_Rule = TypeVar("_Rule", bound=Callable[[Any], Decision])
+_Rule = TypeVar("_Rule", bound=Callable[..., Decision])
 
 
 def add_to(
@@ -293,7 +292,7 @@ def add_to(
 
     def add(rule: _Rule) -> _Rule:
         name = rule.__name__.removeprefix("_")
-        questions[name] = Question(kind, rule, used, reasons, needs, is_cause)
+        questions[name] = Question(kind, rule, used, reasons, tuple(needs.split()), is_cause)
         return rule
 
     return add

@@ -193,12 +193,6 @@ def _time_dependence(run: TaskDiagnosis) -> Decision:
     return Decision(reason, evidence, share)
 
 
-def _limits_of(run: TaskDiagnosis) -> Violations:
-    limits = run.measurements.limits
-    assert limits is not None  # the questions are asked only then
-    return limits
-
-
 @add_to(
     WHERE,
     "limits",
@@ -207,8 +201,7 @@ def _limits_of(run: TaskDiagnosis) -> Violations:
     thresholds="rarely_violating gain",
     needs="limits",
 )
-def _constraint_violation(run: TaskDiagnosis) -> Decision:
-    limits = _limits_of(run)
+def _constraint_violation(run: TaskDiagnosis, limits: Violations) -> Decision:
     inside, outside, visited = limits.report.regions[0], limits.report.regions[-1], limits.visited
     share = max(inside.violating_share, visited.violating_share)
     gain = inside.step_reward - limits.cut_off.step_reward
@@ -241,18 +234,15 @@ def _constraint_violation(run: TaskDiagnosis) -> Decision:
     return Decision(reason, evidence)
 
 
-def _distractors_of(run: TaskDiagnosis) -> tuple[DistractorRegret, ObservationReport]:
-    distraction, observation = run.measurements.distraction, run.measurements.observation
-    assert distraction is not None
-    assert observation is not None
-    return distraction, observation
-
-
 @_where(
-    yes="similarity_lost", no="similarity_kept", thresholds="distractor_loss", needs="distraction"
+    yes="similarity_lost",
+    no="similarity_kept",
+    thresholds="distractor_loss",
+    needs="distraction observation",
 )
-def _distractors_outside(run: TaskDiagnosis) -> Decision:
-    _, observation = _distractors_of(run)
+def _distractors_outside(
+    run: TaskDiagnosis, _: DistractorRegret, observation: ObservationReport
+) -> Decision:
     outside = observation.distractor_regions[-1]
     loss = 100.0 * (outside.mae - run.measurements.policy.mae)
     evidence = {
@@ -269,10 +259,11 @@ def _distractors_outside(run: TaskDiagnosis) -> Decision:
     no="state_alone_kept neither_kept",
     unclear="layers_unknown",
     thresholds="kept_r2",
-    needs="distraction",
+    needs="distraction observation",
 )
-def _distractors_represented(run: TaskDiagnosis) -> Decision:
-    _, observation = _distractors_of(run)
+def _distractors_represented(
+    _run: TaskDiagnosis, _: DistractorRegret, observation: ObservationReport
+) -> Decision:
     if len(observation.probes) < 2:
         return Decision("layers_unknown", {})
     last = observation.probes[-1]
@@ -451,8 +442,8 @@ def _budget(run: TaskDiagnosis) -> Decision:
     thresholds="rarely_violating price_share",
     needs="limits",
 )
-def _price_of_safety(run: TaskDiagnosis) -> Decision:
-    limits, regret = _limits_of(run), run.measurements.policy.regret
+def _price_of_safety(run: TaskDiagnosis, limits: Violations) -> Decision:
+    regret = run.measurements.policy.regret
     price = limits.report.regions[0].price_of_safety
     violating = max(limits.report.regions[0].violating_share, limits.visited.violating_share)
     evidence = {"price_of_safety": price, "regret": regret, "violating_share": violating}
@@ -466,10 +457,11 @@ def _price_of_safety(run: TaskDiagnosis) -> Decision:
     yes="distracted",
     no="hardly_distracted invariant",
     thresholds="owed_to_distractors invariant",
-    needs="distraction",
+    needs="distraction observation",
 )
-def _distraction(run: TaskDiagnosis) -> Decision:
-    effect, observation = _distractors_of(run)
+def _distraction(
+    run: TaskDiagnosis, effect: DistractorRegret, observation: ObservationReport
+) -> Decision:
     sensitivity = observation.sensitivity[0].sensitivity
     reason = "invariant" if sensitivity <= THRESHOLDS["invariant"] else "hardly_distracted"
     if effect.owed_regret >= THRESHOLDS["owed_to_distractors"]:

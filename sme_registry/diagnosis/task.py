@@ -69,8 +69,8 @@ def diagnose_task(
     """The arguments and errors are those of `diagnose`."""
     measured = _measurements(subject, states, episodes, seed, report)
     if probe_capacity:
-        probe = _probe(subject, seed, report)
-        measured = measured.model_copy(update={"capacity": probe})
+        report(f"{subject.name}: capacity, by fitting a network to the optimal actions")
+        measured = measured.model_copy(update={"capacity": _probe(subject, seed)})
     diagnosis = diagnosed(subject, measured)
     if against is None:
         return diagnosis
@@ -128,19 +128,13 @@ def _limits_and_distractors(
     return fields
 
 
-def _probe(subject: Subject, seed: int, report: Callable[[str], None]) -> CapacityProbe | None:
+def _probe(subject: Subject, seed: int) -> CapacityProbe | None:
     assert isinstance(subject.policy, Policy)  # of a single agent
     network = perceptron_of(subject.policy)
-    if network is None:
-        return None
-
-    def progress(done: int) -> None:
-        total = behaviour.GRADIENT_STEPS
-        report(f"{subject.name}: capacity, {done:,} of {total:,} gradient steps")
-
     steps = subject.plan.get("steps")
     count = steps if isinstance(steps, int) and steps else behaviour.DEFAULT_STATES
-    return behaviour.probe_capacity(network, materialize(subject.spec), count, seed, progress)
+    task = materialize(subject.spec)
+    return None if network is None else behaviour.probe_capacity(network, task, count, seed)
 
 
 def _compare(run: TaskDiagnosis, other: TaskDiagnosis) -> Comparison:
@@ -273,13 +267,6 @@ class TeamDiagnosis(Diagnosis):
 
     def parts(self) -> Iterator[Part]:
         """A table of the agents; all answers on request."""
-        table, *others = self.tables()
-        yield table
-        answers = (self.findings("Findings", self.verdicts), *self.answers(self.verdicts))
-        yield from (part._replace(detail=True) for part in (*answers, *others))
-
-    def tables(self) -> Iterator[Part]:
-        """Each agent's numbers, and where its own error is."""
         rows = [
             (
                 agent.name,
@@ -293,6 +280,10 @@ class TeamDiagnosis(Diagnosis):
         ]
         notes = (_LEGEND, words("left_out", self.left_out))
         yield Part("Agents", _COLUMNS, rows, notes)
+        yield from (part._replace(detail=True) for part in super().parts())
+
+    def tables(self) -> Iterator[Part]:
+        """Where the error of each agent is."""
         for agent in self.agents:
             where = self.findings("", agent.verdicts)
             yield where._replace(heading=f"Where the error of {agent.name} is")

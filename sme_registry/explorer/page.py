@@ -290,16 +290,18 @@ def _episode(
     n = max(1, min(episodes, MAX_NUMBERS // (T * (S + A + 8))))
     starts = draw.uniform(seed, "explorer/starts", n * S).reshape(n, S)
 
-    def steps(act: Callable[[Any], Any], *, sees_state: bool = False) -> tuple[Array, Any]:
-        runs = rollout(act, task, starts, seed, sees_state=sees_state)
-        return 1.0 - np.mean([run.reward for run in runs], axis=0), runs[0].alive
+    def over_time(act: Callable[[Any, Any], Any]) -> dict[str, Any]:
+        runs = rollout(act, task, starts, seed)
+        regret = 1.0 - np.mean([run.reward for run in runs], axis=0)
+        return _over_time(regret, runs[0].alive, T)
 
     half = np.full((n, A), 0.5)
     lines = {
-        LABELS[name]: _over_time(*steps(act, sees_state=True), T)["mean"]
-        for name, act in ((_LINEAR, fitted.linear), (_HALF, lambda s: half))
+        LABELS[_LINEAR]: over_time(lambda s, _: fitted.linear(s))["mean"],
+        LABELS[_HALF]: over_time(lambda *_: half)["mean"],
     }
-    own = {} if subject is None else _over_time(*steps(subject.policy.start()), T)
+    policy = None if subject is None else subject.policy.start()
+    own = {} if policy is None else over_time(lambda _, seen: policy(seen))
     return {"episodes": n, "t": _edges(T)[:-1].tolist(), "references": lines, **own}
 
 

@@ -47,11 +47,6 @@ def verdicts_on(measurements, spec, comparison=None, updates=None):
     return run.judged(TASK_QUESTIONS).verdicts
 
 
-def markdown(diagnosis, figures=(), details=False):
-    """The page of a diagnosis."""
-    return diagnosis.markdown(figures, details=details)
-
-
 def printed(diagnosis, width=None, details=False):
     """The lines on a terminal of this width, or in a pipe."""
     parts = diagnosis.terminal(details=details)

@@ -127,7 +127,6 @@ def test_levels_over_time_fall_towards_the_end_of_an_episode_and_continuing_ones
 @pytest.mark.parametrize(
     ("judged", "arguments", "says"),
     [
-        (lambda: model(PPO), {"kind": "Q"}, "critic of V, not of Q"),
         (lambda: model(PPO), {"task": "Default"}, "trained on"),
         (lambda: model(PPO), {"task": "Team2"}, "agents"),
         (lambda: model(PPO), {"states": 0}, "states=0"),
@@ -186,14 +185,14 @@ def test_what_is_found_of_a_critic_has_its_verdict_and_a_sentence_with_numbers(
     assert len(verdict.sentence()) > 20
 
 
-def test_a_diagnosis_of_a_model_has_its_critic_and_draws_it(laid_out, tmp_path):
+def test_a_diagnosis_of_a_model_has_its_critic_and_draws_it(figures, tmp_path):
     pytest.importorskip("matplotlib")
     spec = SMESpec(**SMALL, shaping={"scale": 3})
     diagnosis = diagnose(load_policy(model(TD3, spec=spec), spec), states=64, episodes=8)
     assert diagnosis.measurements.critic.region("OOD 5").misled_ranking is not None
     assert diagnosis.verdict("critic_level").evidence["gamma"] == 0.9
     draw(diagnosis, tmp_path)
-    labels = [axes.get_ylabel() for figure in laid_out for axes in figure.axes]
+    labels = {axes.get_ylabel() for figure in figures for axes in figure.axes}
     assert "discounted value" in labels
     assert "critic" not in diagnosis_of("linear", DEEP).model_dump()["measurements"]
 
@@ -224,8 +223,6 @@ def test_of_iql_only_the_ranking_is_known_from_its_folder_or_its_policy(iql):
     assert cube.ranking > 0.6
     assert (cube.claim, cube.finite, cube.continuing, cube.bias) == (None,) * 4
     assert critic(folder / "policy.npz", spec, states=200) == report
-    with pytest.raises(SMEError, match="critic of Q, not of V"):
-        critic(folder, spec, kind="V")
     with pytest.raises(SMEError, match="trained on"):
         critic(folder, "Default")
 
@@ -242,7 +239,7 @@ def test_critics_are_those_of_the_learner_and_bc_has_none():
     assert OfflineLearner(BCHyperparameters(), data, 32, about).critics == []
 
 
-def test_an_offline_training_is_diagnosed_with_its_critic(iql, laid_out, tmp_path):
+def test_an_offline_training_is_diagnosed_with_its_critic(iql, figures, tmp_path):
     pytest.importorskip("matplotlib")
     diagnosis = diagnose(load_run(iql[0]), states=64, episodes=8)
     assert diagnosis.plan["algorithm"] == "iql"
@@ -250,6 +247,6 @@ def test_an_offline_training_is_diagnosed_with_its_critic(iql, laid_out, tmp_pat
     verdict = diagnosis.verdict("critic_level")
     assert (verdict.answer, verdict.reason) == ("cannot tell", "level_of_data")
     draw(diagnosis, tmp_path)
-    labels = [axes.get_ylabel() for figure in laid_out for axes in figure.axes]
+    labels = {axes.get_ylabel() for figure in figures for axes in figure.axes}
     assert sum("the critic" in label for label in labels) == 1
     assert "discounted value" not in labels

@@ -10,12 +10,13 @@ from sme_registry.diagnosis import behaviour
 from sme_registry.diagnosis.measure import POLICY
 from tests.diagnosis.policies import (
     DEEP,
+    EXTENDED,
     SPEC,
     Noisy,
     diagnosis_of,
+    distracted,
     optimum,
     shrunk,
-    time_dependent,
     with_offset,
 )
 
@@ -51,9 +52,9 @@ def test_scores_and_shells_agree_with_evaluate():
 
 
 def test_equal_seeds_give_equal_numbers_and_another_seed_other_numbers():
-    diagnosis = diagnosis_of(time_dependent)
-    assert diagnosis_of.__wrapped__(time_dependent) == diagnosis
-    assert diagnosis_of(time_dependent, seed=1).measurements != diagnosis.measurements
+    diagnosis = diagnosis_of(distracted, EXTENDED)
+    assert diagnosis_of.__wrapped__(distracted, EXTENDED) == diagnosis
+    assert diagnosis_of(distracted, EXTENDED, seed=1).measurements != diagnosis.measurements
 
 
 def test_a_payout_over_k_independent_rewards_is_explained_by_one_kth():
@@ -103,7 +104,7 @@ def test_the_probe_fits_what_a_network_can_represent_and_fails_at_the_rest(monke
             for pair in itertools.pairwise(widths)
         ]
         network = Perceptron((*inner, (*last[:2], "identity")))
-        return behaviour.probe_capacity(network, materialize(spec), states, 0, lambda done: None)
+        return behaviour.probe_capacity(network, materialize(spec), states, 0)
 
     monkeypatch.setattr(behaviour, "GRADIENT_STEPS", 300)
     monkeypatch.setattr(behaviour, "_MIN_STATES", 16)

@@ -7,17 +7,16 @@ from itertools import chain
 import pytest
 
 from sme_registry import SMESpec
-from sme_registry.diagnosis import Diagnosis, diagnose, load_policy
+from sme_registry.diagnosis import diagnose, load_policy
 from sme_registry.diagnosis.behaviour import CapacityProbe, TrainingSummary
 from sme_registry.diagnosis.critic_rules import CRITIC
-from sme_registry.diagnosis.document import Measurements, TaskDiagnosis
+from sme_registry.diagnosis.document import Measurements
 from sme_registry.diagnosis.questions import COMMON_REASONS, DOUBTS, Comparison, Difference, label
 from sme_registry.diagnosis.task import TASK_QUESTIONS
 from tests.diagnosis.policies import (
     EXTENDED,
     SPEC,
     diagnosis_of,
-    markdown,
     near_the_centre_only,
     network,
     printed,
@@ -137,7 +136,7 @@ def compared():
 
 def test_markdown_holds_every_sentence_the_headline_and_the_figures(compared):
     unfinished = compared.model_copy(update={"checkpoint_step": 1234})
-    page = markdown(unfinished, ["a_b.png"], details=True)
+    page = unfinished.markdown(["a_b.png"], details=True)
     for verdict in compared.verdicts:
         assert verdict.sentence().replace("|", r"\|") in page
     assert compared.headline() in page
@@ -146,7 +145,7 @@ def test_markdown_holds_every_sentence_the_headline_and_the_figures(compared):
     tables = [line for line in page.splitlines() if line.startswith("|")]
     rules = [line for line in tables if set(line) <= {"|", "-"}]
     assert len(rules) == sum(bool(part.rows) for part in compared.parts())
-    assert len(markdown(compared)) < len(page) / 2
+    assert len(compared.markdown()) < len(page) / 2
     assert all(line.endswith("|") for line in tables)
 
 
@@ -175,26 +174,6 @@ def test_findings_are_sorted_by_their_share_of_the_error():
     assert shares == sorted(shares, reverse=True)
     assert 1 < len(shares) < len(answers)
     assert answers[len(shares) :] == ["yes"] * (len(answers) - len(shares))
-
-
-def test_a_diagnosis_of_schema_1_is_read(compared):
-    old = compared.to_dict()
-    for field in ("seeds", "updates"):
-        del old[field]
-    for verdict in old["verdicts"]:
-        del verdict["error_share"]
-        verdict["thresholds"] = {}  # older rules named fewer
-    response, uniform = old["measurements"]["response"], old["measurements"]["uniform"]
-    response["sensitivity"] = response.pop("steepness")
-    uniform["linear_least_squares"] = uniform.pop("linear")
-    read = Diagnosis.from_dict({**old, "schema_version": 1}, "old")
-    assert isinstance(read, TaskDiagnosis)
-    assert (read.comparison, read.measurements) == (compared.comparison, compared.measurements)
-    assert (read.schema_version, read.updates) == (3, None)
-    assert [verdict.answer for verdict in read.verdicts] == [v.answer for v in compared.verdicts]
-    assert all(
-        v.sentence().replace("|", r"\|") in markdown(read, details=True) for v in read.verdicts
-    )
 
 
 @pytest.mark.parametrize(("updates", "answer"), [(None, "yes"), (19, "cannot tell"), (20, "yes")])

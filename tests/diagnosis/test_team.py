@@ -15,7 +15,7 @@ from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies import run_study
 from sme_registry.studies.subject import load_cell
 from tests.commands import good
-from tests.diagnosis.policies import markdown, printed
+from tests.diagnosis.policies import printed
 from tests.geometry import assert_readable
 
 AGENTS = [
@@ -70,7 +70,7 @@ def test_a_team_has_words_for_the_terminal_a_pipe_and_a_notebook_which_runs_no_h
     assert any(line.startswith("blame: yes, ") for line in lines)
     assert max(map(len, lines)) <= 100
     assert one_fails.headline().startswith("driver_1 is to blame: ")
-    assert "| driver_1 |" in markdown(one_fails, ["who_agents.png"])
+    assert "| driver_1 |" in one_fails.markdown(["who_agents.png"])
     page = one_fails.model_copy(update={"name": "<script>![i](http://e)"})._repr_markdown_()
     assert page.startswith("# &lt;script>![i]\\(http://e) on ")
     assert "<" not in page
@@ -232,7 +232,7 @@ def trained(folder, **options):
     return folder
 
 
-def test_the_command_diagnoses_a_run_of_a_team(tmp_path, laid_out):
+def test_the_command_diagnoses_a_run_of_a_team(tmp_path, figures):
     run, why = trained(tmp_path / "run"), tmp_path / "why"
     result = good("diagnose", run, "--states", "64", "--episodes", "8", "--out", why)
     assert "driver_1" in result.stdout
@@ -241,7 +241,7 @@ def test_the_command_diagnoses_a_run_of_a_team(tmp_path, laid_out):
     assert written.plan["algorithm"] == "PPO"
     assert "who_agents.png" in (why / "diagnosis.md").read_text()
     assert (why / "who_agents.png").exists()
-    assert_readable(laid_out[-1])  # the others are those of the training
+    assert_readable(figures[-1])  # the others are those of the training
 
 
 def test_a_run_of_independent_agents_is_diagnosed(tmp_path):
