@@ -16,6 +16,7 @@ themselves.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, cached_property, partial
@@ -214,6 +215,7 @@ class Pages:
             chart = tables.regret_chart(result.scores.normalised_regret, edges, name)
             sparks = tables.sparklines([each.normalised_regret for each in result.classes])
             classes = list(zip(result.classes, sparks, strict=True))
+        scores = result.runs if result is not None and result.runs else itertools.repeat(None)
         versions = tables.versions_of(entry, self._listed)
         return self.render(
             "submission.html",
@@ -236,7 +238,8 @@ class Pages:
             classes=classes,
             agents=[] if result is None else tables.agent_rows(self.document, submission, result),
             regions=tables.region_labels(edges),
-            runs=tables.run_rows(submission, result, self._class_of),
+            runs=zip(submission.runs, scores, strict=False),
+            class_of=self._class_of,
             explored=self._explored(id),
         )
 

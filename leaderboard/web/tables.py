@@ -27,7 +27,7 @@ from leaderboard.documents.result import (
     Result,
     RunScore,
 )
-from leaderboard.documents.submission import Run, Submission, skeleton
+from leaderboard.documents.submission import Submission, skeleton
 from leaderboard.scoring.ranking import RankedRow, class_mean, groups_of, never_listed
 from sme_registry import SMESpec
 from sme_registry.io import visible
@@ -85,36 +85,24 @@ def versions_of(entry: EntryRow, entries: list[EntryRow]) -> list[EntryRow]:
     ]
 
 
-def run_rows(
-    submission: Submission, result: Result | None, class_of: Mapping[str, str]
-) -> list[tuple[str, Run | None, RunScore | None]]:
-    """Class name, run and score of the submitted runs, then of those started and not listed."""
-    pairs = itertools.zip_longest(submission.runs, result.runs if result else ())
-    return [
-        (class_of.get(run.spec, "not in this suite") if run else score.class_name, run, score)
-        for run, score in pairs
-    ]
-
-
 @dataclass(frozen=True)
 class AgentRow:
     """One agent of a class of teams, over the runs of the class as for its score."""
 
     class_name: str
     agent: str
-    wd_regret: float
     ood_regret: float
-    normalised_regret: tuple[float, ...]  # of each region, WD first
+    normalised_regret: Sequence[float]  # of each region, WD first
 
 
 def agent_rows(board: BoardDocument, submission: Submission, result: Result) -> list[AgentRow]:
     """The agents of each class of teams; a run without a policy counts as 1 for each of them."""
-    listed = result.runs[: len(submission.runs)]
-    if not any(run.agents for run in listed):
+    runs = result.runs
+    if not any(run.agents for run in runs):
         return []
     rows = []
-    for name, members in groups_of(board, [*listed, *never_listed(board, submission)]).items():
-        agents = next((run.agents for run in listed if run.agents and run.class_name == name), ())
+    for name, members in groups_of(board, [*runs, *never_listed(board, submission)]).items():
+        agents = next((run.agents for run in runs if run.agents and run.class_name == name), ())
         for index, agent in enumerate(agents):
 
             def regrets(run: RunScore, index: int = index) -> list[float]:
@@ -122,7 +110,7 @@ def agent_rows(board: BoardDocument, submission: Submission, result: Result) -> 
                 return [*own, sum(own[1:]) / len(own[1:])]
 
             *means, ood = class_mean(members, regrets).tolist()
-            rows.append(AgentRow(name, agent.name, means[0], ood, tuple(means)))
+            rows.append(AgentRow(name, agent.name, ood, means))
     return rows
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from leaderboard.documents.result import ClassScore, Estimate, Result, RunScore, Scores
+from leaderboard.documents.result import Result, RunScore
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import Submission
-from leaderboard.scoring.ranking import failed_run, levels_of, run_metrics
+from leaderboard.scoring.ranking import levels_of, never_listed, result_of, run_metrics
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.io import sha256_of
 from sme_registry.spec import EvaluationProtocol, Suite
@@ -38,6 +38,7 @@ def create(path, *, classes=3, references=True):
         suite=suite(classes),
         protocol_name="paper-v1",
         protocol=EvaluationProtocol(),
+        draws=200,
     )
     if references:
         submit_references(store)
@@ -53,7 +54,7 @@ def submit_references(store):
 
 def submit(
     store, key, name, profile, *, version="1.0", family="PPO", knowledge="generic",
-    submitter="Ada", runs=10, missing=0, spread=0.05, rejected=None, oracle_like=False, **fields
+    submitter="Ada", runs=10, missing=0, spread=0.05, rejected=None, **fields
 ):  # fmt: skip
     """Submit a method and write the result that this profile, WD first, would give; its id.
 
@@ -86,7 +87,7 @@ def submit(
     signed = Submission.from_dict(plain).signed(key, Receiver(document.key))
     store.receive(signed)
     if profile is not None:
-        assert score(store, profile, spread, missing, oracle_like) == signed.id
+        assert score(store, profile, spread) == signed.id
     elif rejected is not None:
         code, message = rejected
         finish(store, claimed(store), status="rejected", code=code, message=message)
@@ -104,7 +105,7 @@ def finish(store, claim, **result):
     assert store.queue.finish(claim, Result(**digests, **result))
 
 
-def score(store, profile, spread=0.0, missing=0, oracle_like=False):
+def score(store, profile, spread=0.0):
     """Write a result of about this profile for the submission whose turn it is; its id."""
     document, claim = store.document, claimed(store)
     submission = store.submission(claim.id).content
@@ -114,58 +115,22 @@ def score(store, profile, spread=0.0, missing=0, oracle_like=False):
     rng = np.random.default_rng(int(_digest(name)[7:23], 16))
     runs = []
     for number, run in enumerate(submission.runs):
-        member, _ = document.instances[run.spec]
         regret = np.abs(np.asarray(profile) + spread * rng.normal(size=len(levels)))
         similarity = 1.0 - 0.25 * regret
         runs.append(
             RunScore(
                 spec=run.spec,
-                class_name=member,
-                artefact=run.artefact and run.artefact.sha256,
+                class_name=document.instances[run.spec][0],
+                artefact=run.artefact.sha256,
                 evaluation_seed=2**52 + 7919 * number,
                 normalised_regret=tuple(regret.tolist()),
                 similarity=tuple(similarity.tolist()),
                 **run_metrics(regret, similarity, levels),
             )
         )
-    for member in submission.runs_started:
-        runs += [failed_run(document.protocol, member, None)] * missing
-    regrets = np.array([run.normalised_regret for run in runs])
-    classes = []
-    for member in submission.runs_started:
-        own = np.array([run.class_name == member for run in runs])
-        mean = regrets[own].mean(axis=0)
-        classes.append(
-            ClassScore(
-                name=member,
-                runs=int(own.sum()),
-                submitted=int(own.sum()) - missing,
-                wd_regret=float(mean[0]),
-                ood_regret=float(mean[1:].mean()),
-                normalised_regret=tuple(mean.tolist()),
-            )
-        )
-    mean = regrets.mean(axis=0)
-    wd, decay = mean[0], mean[1:].mean() - mean[0]
-    scores = Scores(
-        wd_regret=_estimate(wd, spread, 0.0),
-        ood_regret=_estimate(wd + decay, spread, 0.0),
-        ood_decay=_estimate(decay, 0.6 * spread),
-        regret_slope=_estimate(np.polyfit(levels, mean, 1)[0], 0.6 * spread),
-        similarity_loss=_estimate(25 * decay, 6 * spread),
-        normalised_regret=tuple(_estimate(value, 1.4 * spread, 0.0) for value in mean),
-    )
-    finish(
-        store,
-        claim,
-        status="scored",
-        scores=scores,
-        classes=tuple(classes),
-        runs=tuple(runs),
-        enough_runs=all(member.runs >= document.runs_to_rank for member in classes),
-        oracle_like=oracle_like,
-        versions=VERSIONS,
-    )
+    unlisted = never_listed(document, submission)
+    result = result_of(document, claim.id, runs, VERSIONS, unlisted=unlisted)
+    assert store.queue.finish(claim, result)
     return claim.id
 
 
@@ -173,89 +138,49 @@ def _digest(text):
     return sha256_of(text.encode())
 
 
-def _estimate(value, half, least=-np.inf):
-    low, high = max(least, float(value - half)), float(value + 1.2 * half)
-    return Estimate(value=float(value), low=low, high=high)
-
-
 def furnish(store):
     """Every kind of entry; their ids by what they are."""
     lab, okafor, anon, student = (SigningKey.generate() for _ in range(4))
     delft = {"version": "2.7.1", "submitter": "Control Lab, Delft"}
+    of_okafor = {"submitter": "R. Okafor"}
 
-    def rising(start, step):
-        return [start + step * m for m in range(6)]
+    def add(key, name, start, step, **fields):
+        return submit(store, key, name, [start + step * m for m in range(6)], **fields)
 
+    training = {
+        "library": "Stable-Baselines3 2.7.1",
+        "hyperparameters": "learning_rate=3e-4\nbatch_size=256\nnet_arch=[256, 256]",
+        "hardware": "1 × RTX 4090, 3 h",
+    }
+    statement = "Trained with the library's defaults.\nNo tuning on the evaluation states."
+    code = "https://example.org/sac?a=1&b=2"
+    described = {"code": code, "training": training, "statement": statement}
+    hostile = {
+        "version": HOSTILE[:80],
+        "family": "a\"onx='",
+        "submitter": (RTL + HOSTILE)[:80],
+        "statement": HOSTILE * 3,
+        "code": 'https://example.org/"onmouseover="alert(1)\'<script>',
+        "training": {"library": HOSTILE, "hyperparameters": HOSTILE, "hardware": "</dd></dl>"},
+    }
+    long = {
+        "version": "2026.11-beta+4",
+        "family": "ensemble",
+        "submitter": "Group for Monitoring and Control of Synthetic Environments",
+    }
+    long_name = "A method with quite a long name (ensemble of 16 critics)"
+    own = {"version": "0.3", "family": "model-based", "knowledge": "family", "submitter": "Anon"}
+    broken = "onnx_op", "node 3: op_type='Loop<script>': must be one of the list."
     return {
-        "sac": submit(
-            store,
-            lab,
-            "SAC",
-            rising(0.08, 0.06),
-            **delft,
-            family="SAC",
-            code="https://example.org/sac?a=1&b=2",
-            training={
-                "library": "Stable-Baselines3 2.7.1",
-                "hyperparameters": "learning_rate=3e-4\nbatch_size=256\nnet_arch=[256, 256]",
-                "hardware": "1 × RTX 4090, 3 h",
-            },
-            statement="Trained with the library's defaults.\nNo tuning on the evaluation states.",
-        ),
-        "td3": submit(store, lab, "TD3", rising(0.10, 0.07), **delft, family="TD3", spread=0.03),
-        "ppo": submit(
-            store,
-            okafor,
-            "PPO",
-            rising(0.24, 0.09),
-            version="2.7.1",
-            submitter="R. Okafor",
-            missing=1,
-            spread=0.08,
-        ),
-        "model": submit(
-            store,
-            anon,
-            "DUN-fit",
-            rising(0.004, 0.0002),
-            version="0.3",
-            family="model-based",
-            knowledge="family",
-            submitter="Anon",
-            spread=0.001,
-            oracle_like=True,
-        ),
-        "long": submit(
-            store,
-            anon,
-            "A method with quite a long name (ensemble of 16 critics)",
-            [0.62, 0.71, 0.85, 0.93, 1.08, 1.17],
-            version="2026.11-beta+4",
-            family="ensemble",
-            submitter="Group for Monitoring and Control of Synthetic Environments",
-            spread=0.06,
-        ),
-        "few": submit(store, student, "PPO small", rising(0.3, 0.05), runs=2, submitter="Student"),
-        "hostile": submit(
-            store,
-            student,
-            "x<b>y",
-            rising(0.5, 0.02),
-            version=HOSTILE[:80],
-            family="a\"onx='",
-            submitter=(RTL + HOSTILE)[:80],
-            statement=HOSTILE * 3,
-            code='https://example.org/"onmouseover="alert(1)\'<script>',
-            training={"library": HOSTILE, "hyperparameters": HOSTILE, "hardware": "</dd></dl>"},
-        ),
+        "sac": add(lab, "SAC", 0.08, 0.06, **delft, family="SAC", **described),
+        "td3": add(lab, "TD3", 0.10, 0.07, **delft, family="TD3", spread=0.03),
+        "ppo": add(okafor, "PPO", 0.24, 0.09, version="2.7.1", missing=1, spread=0.08, **of_okafor),
+        "model": add(anon, "DUN-fit", 0.004, 0.0002, **own, spread=0.001),
+        "long": add(anon, long_name, 0.62, 0.11, **long, spread=0.06),
+        "few": add(student, "PPO small", 0.3, 0.05, runs=2, submitter="Student"),
+        "hostile": add(student, "x<b>y", 0.5, 0.02, **hostile),
         "rejected": submit(
-            store,
-            okafor,
-            "Broken",
-            None,
-            version="0.1",
-            submitter="R. Okafor",
-            rejected=("onnx_op", "node 3: op_type='Loop<script>': must be one of the list."),
+            store, okafor, "Broken", None, version="0.1", rejected=broken, **of_okafor
         ),
-        "waiting": submit(store, okafor, "PPO", None, version="2.7.2", submitter="R. Okafor"),
+        "waiting": submit(store, okafor, "PPO", None, version="2.7.2", **of_okafor),
     }
