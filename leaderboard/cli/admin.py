@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -53,6 +54,9 @@ complete_protocol = catalogue.completion(ProtocolFile)
 app = typer.Typer()
 admin = typer.Typer(no_args_is_help=True)
 app.add_typer(admin, name="admin", help="Upkeep, which a served board mostly does by itself.")
+
+# Its characters need no quotes in the commands that the pages show.
+_PUBLIC_URL = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:]+\])(:\d{1,5})?(/[\w.~-]+)*/?", re.ASCII)
 
 UnsafeNoSandbox = Annotated[
     bool,
@@ -291,18 +295,39 @@ def serve(
     Folder(board).read()  # a wrong folder fails before anything listens
     libraries = {"fastapi": "FastAPI", "uvicorn": "uvicorn"}
     require_packages("serving a board", libraries, "leaderboard")
-    from leaderboard.web import app
+    from leaderboard.web import app, server
 
-    app.serve(
-        board,
-        host=host,
-        port=port,
-        workers=workers,
-        url=url,
-        behind_proxy=behind_proxy,
-        unsafe_no_sandbox=unsafe_no_sandbox,
-        season_secrets=season_secret or (),
-    )
+    if url and not _PUBLIC_URL.fullmatch(url):
+        raise OptionError(
+            f"url={url!r:.80}: must be http(s)://host[:port][/path]. Give the address at which "
+            "others reach the board."
+        )
+    if not behind_proxy and not server.is_loopback(host):
+        raise OptionError(
+            f"host={host!r:.80}: must be a loopback address, such as 127.0.0.1. Put a reverse "
+            "proxy in front of it; if only the proxy reaches this address, add --behind-proxy."
+        )
+    if behind_proxy and not url:
+        raise OptionError(
+            "url='': must be the address at which the proxy is reached, such as "
+            "https://board.example: what is sent to a board is signed for its address."
+        )
+    if unsafe_no_sandbox and workers and season_secret:
+        raise OptionError(
+            "--unsafe-no-sandbox: submitted policies could read the files of --season-secret. "
+            "Install bubblewrap, or score no submissions (--workers 0)."
+        )
+    with server.listen(host, port) as listener:
+        address = server.url_of(listener)
+        served = app.create_app(
+            board,
+            url or address,
+            score_workers=workers,
+            isolation="process" if unsafe_no_sandbox else "bwrap",
+            season_secrets=season_secret or (),
+        )
+        print_line(escape(address))
+        server.run(served, listener)
 
 
 @admin.command()

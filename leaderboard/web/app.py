@@ -1,4 +1,4 @@
-"""`create_app`: a board over HTTP, with its pages and a small API; `serve` runs it.
+"""`create_app`: a board over HTTP, with its pages and a small API.
 
     GET  /…                              the pages, at the paths of `pages`
     PUT  /api/objects/<hex>              upload an artefact; signed, see `admission.uploads`
@@ -22,13 +22,11 @@ import functools
 import hashlib
 import os
 import re
-import signal
 from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from importlib.util import find_spec
 from typing import Any
 
 import anyio
-import uvicorn
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from starlette.exceptions import HTTPException
@@ -49,7 +47,7 @@ from leaderboard.web import server
 from leaderboard.web.client import public_view
 from leaderboard.web.pages import Pages, Section, content_type
 from leaderboard.web.server import HTTP_CODES, RequestError
-from sme_registry.errors import OptionError, SMEError
+from sme_registry.errors import SMEError
 from sme_registry.io import server_address
 
 _Board: type[Store] = Store
@@ -338,64 +336,3 @@ def _digest(digits: str) -> str:
             "'sha256:'.",
         )
     return f"sha256:{digits}"
-
-
-# Its characters need no quotes in the commands that the pages show.
-_PUBLIC_URL = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:]+\])(:\d{1,5})?(/[\w.~-]+)*/?", re.ASCII)
-
-
-def serve(
-    path: str | os.PathLike[str],
-    host: str = "127.0.0.1",
-    port: int = 8000,
-    workers: int = 1,
-    announce: Callable[[str], None] = print,
-    url: str = "",
-    behind_proxy: bool = False,
-    unsafe_no_sandbox: bool = False,
-    season_secrets: Iterable[str | os.PathLike[str]] = (),
-) -> None:
-    """Serve a board and run its scorers until Ctrl-C or SIGTERM, which both end it cleanly.
-
-    Call it in the main thread, where signals arrive. Any address but the loopback needs
-    `behind_proxy`; port 0 is any free one; `announce` gets the URL once it listens. What is sent is
-    signed for `url`, by default where it listens. With `unsafe_no_sandbox`, submitted policies
-    could read the files of this account and use the network: nobody else may submit.
-    """
-    if url and not _PUBLIC_URL.fullmatch(url):
-        raise OptionError(
-            f"url={url!r:.80}: must be http(s)://host[:port][/path]. Give the address at which "
-            "others reach the board."
-        )
-    if not behind_proxy and not server.is_loopback(host):
-        raise OptionError(
-            f"host={host!r:.80}: must be a loopback address, such as 127.0.0.1. Put a reverse "
-            "proxy in front of it; if only the proxy reaches this address, add --behind-proxy."
-        )
-    secrets = list(season_secrets)
-    if unsafe_no_sandbox and workers and secrets:
-        raise OptionError(
-            "unsafe_no_sandbox=True: must be False with season_secrets, which submitted policies "
-            "could read. Install bubblewrap, or score no submissions (--workers 0)."
-        )
-    if behind_proxy and not url:
-        raise OptionError(
-            "url='': must be the address at which the proxy is reached, such as "
-            "https://board.example: what is sent to a board is signed for its address."
-        )
-    with server.listen(host, port) as listener:
-        app = create_app(
-            path,
-            url or server.url_of(listener),
-            score_workers=workers,
-            isolation="process" if unsafe_no_sandbox else "bwrap",
-            season_secrets=secrets,
-        )
-        announce(server.url_of(listener))
-        # Uvicorn shuts down on both signals, then raises the one it received.
-        previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
-        try:
-            with contextlib.suppress(KeyboardInterrupt):
-                uvicorn.Server(server.config_of(app)).run(sockets=[listener])
-        finally:
-            signal.signal(signal.SIGTERM, previous)

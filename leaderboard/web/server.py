@@ -7,10 +7,12 @@ server listens on this machine alone, unless it is told that a proxy is in front
 
 from __future__ import annotations
 
+import contextlib
 import html
 import ipaddress
 import logging
 import re
+import signal
 import socket
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -231,6 +233,17 @@ def config_of(app: ASGIApp) -> uvicorn.Config:
         proxy_headers=False,
         timeout_graceful_shutdown=5,
     )
+
+
+def run(app: ASGIApp, listener: socket.socket) -> None:
+    """Serve until Ctrl-C or SIGTERM, which both end it cleanly; in the main thread."""
+    # Uvicorn shuts down on both signals, then raises the one it received.
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            uvicorn.Server(config_of(app)).run(sockets=[listener])
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def is_loopback(host: str) -> bool:

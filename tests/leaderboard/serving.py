@@ -19,10 +19,11 @@ from leaderboard.web.server import config_of, listen, url_of
 _SERVE = """
 import sys
 import uvicorn
-from leaderboard.web.app import serve
+from pathlib import Path
+from leaderboard.cli.admin import serve
 Config = uvicorn.Config
 uvicorn.Config = lambda *given, **named: Config(*given, **named | {"timeout_graceful_shutdown": 60})
-serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(url, flush=True))
+serve(Path(sys.argv[1]), port=0, workers=int(sys.argv[2]))
 """
 
 

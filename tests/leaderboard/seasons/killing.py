@@ -28,10 +28,10 @@ from tests.leaderboard.seasons.playing import LANES
 
 _SERVE = """
 import sys
-from leaderboard.web.app import serve
+from pathlib import Path
+from leaderboard.cli.admin import serve
 board, secret, port = sys.argv[1:]
-serve(board, port=int(port), workers=0, announce=lambda url: print(url, flush=True),
-      season_secrets=[secret])
+serve(Path(board), port=int(port), workers=0, season_secret=[Path(secret)])
 """
 
 

@@ -17,13 +17,13 @@ import httpx
 import pytest
 
 from leaderboard import admission
+from leaderboard.cli.admin import serve
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import utc
 from leaderboard.errors import BoardError
 from leaderboard.gate import isolation
 from leaderboard.web import app
-from leaderboard.web.app import serve
 from leaderboard.web.client import PublicView
 from leaderboard.web.server import HTTP_CODES, STATUSES
 from sme_registry.errors import OptionError
@@ -264,8 +264,8 @@ def test_serve_refuses_what_it_cannot_do(store):
             serve(path, port=0, workers=0, url=url)
     with pytest.raises(OptionError, match="url=''"):  # of the proxy, which nothing here tells
         serve(path, port=0, workers=0, behind_proxy=True)
-    with pytest.raises(OptionError, match="unsafe_no_sandbox=True"):  # policies could read it
-        serve(path, port=0, unsafe_no_sandbox=True, season_secrets=["a.master"])
+    with pytest.raises(OptionError, match="--unsafe-no-sandbox"):  # policies could read it
+        serve(path, port=0, unsafe_no_sandbox=True, season_secret=[Path("a.master")])
     with (
         socket.create_server(("127.0.0.1", 0)) as taken,
         pytest.raises(BoardError, match="cannot listen here"),
