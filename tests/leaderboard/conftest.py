@@ -5,9 +5,10 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.seasons.store import SeasonStore
@@ -81,30 +82,20 @@ def tiny_board(path, *, instances=1, **fields):
 @functools.cache
 def linear_onnx(number, observation_dim=4, action_dim=1):
     """A policy a = clip(s W + number/1000, 0, 1), one of its own for each number."""
-    import numpy as np
-    import onnx
-    from onnx import TensorProto, helper, numpy_helper
+    from tests.leaderboard.gate.models import model, node, tensor, value  # which import onnx
 
-    weights = np.full((observation_dim, action_dim), 0.1, np.float32)
-    bias = np.full(action_dim, number / 1000, np.float32)
-    graph = helper.make_graph(
-        [
-            helper.make_node("Gemm", ["observations", "W", "b"], ["raw"]),
-            helper.make_node("Clip", ["raw", "low", "high"], ["actions"]),
-        ],
-        "policy",
-        [helper.make_tensor_value_info("observations", TensorProto.FLOAT, ["B", observation_dim])],
-        [helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["B", action_dim])],
-        [
-            numpy_helper.from_array(weights, "W"),
-            numpy_helper.from_array(bias, "b"),
-            numpy_helper.from_array(np.float32(0), "low"),
-            numpy_helper.from_array(np.float32(1), "high"),
-        ],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    onnx.checker.check_model(model)
-    return model.SerializeToString()
+    constants = {
+        "W": np.full((observation_dim, action_dim), 0.1),
+        "b": np.full(action_dim, number / 1000),
+        "low": 0.0,
+        "high": 1.0,
+    }
+    return model(
+        [node("Gemm", "o W b", "raw"), node("Clip", "raw low high", "a")],
+        [tensor(name, np.asarray(each, np.float32)) for name, each in constants.items()],
+        inputs=[value("o", "batch", observation_dim)],
+        outputs=[value("a", "batch", action_dim)],
+    ).SerializeToString()
 
 
 def tiny_submission(store, key, number=0, **fields):
@@ -128,6 +119,15 @@ def tiny_submission(store, key, number=0, **fields):
     return Submission.from_dict(plain).signed(key, Receiver(store.document.key)), {
         policy["sha256"]: data
     }
+
+
+def write_bundle(folder, signed, artefacts):
+    """A bundle's folder."""
+    (folder / "artefacts").mkdir(parents=True)
+    (folder / "submission.json").write_bytes(signed.to_bytes())
+    for digest, data in artefacts.items():
+        (folder / "artefacts" / f"{hex_of(digest)}.onnx").write_bytes(data)
+    return folder
 
 
 def put_submission(store, key, number=0, **fields):

@@ -4,7 +4,6 @@ from functools import partial
 import pytest
 
 from leaderboard import admission
-from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, utc
 from leaderboard.errors import Rejection, ScoringFault
@@ -19,6 +18,7 @@ from tests.leaderboard.conftest import (
     signed_withdrawal,
     tiny_board,
     tiny_submission,
+    write_bundle,
 )
 from tests.leaderboard.store.synthetic import synthetic_result
 
@@ -28,14 +28,6 @@ ANY_TIME = "2000-01-01T00:00:00Z"
 def put(store, key, artefacts):
     for digest, data in artefacts.items():
         store.put_object(digest, data, by=key.public)
-
-
-def bundle(folder, signed, artefacts):
-    (folder / "artefacts").mkdir(parents=True)
-    (folder / "submission.json").write_bytes(signed.to_bytes())
-    for digest, data in artefacts.items():
-        (folder / "artefacts" / f"{hex_of(digest)}.onnx").write_bytes(data)
-    return folder
 
 
 def objects(store):
@@ -247,21 +239,21 @@ def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(tmp_pat
 
 def test_a_bundle_that_is_refused_leaves_nothing(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key, created=ANY_TIME)
-    folder = bundle(tmp_path / "old", signed, artefacts)
+    folder = write_bundle(tmp_path / "old", signed, artefacts)
     assert code_of(lambda: admission.submit_bundle(store, folder)) == "stale_time"
     signed, artefacts = tiny_submission(store, key)
-    folder = bundle(tmp_path / "changed", signed, dict.fromkeys(artefacts, b"?"))
+    folder = write_bundle(tmp_path / "changed", signed, dict.fromkeys(artefacts, b"?"))
     assert code_of(lambda: admission.submit_bundle(store, folder)) == "artefact_digest"
     assert (objects(store), store.entries()) == ([], [])
 
 
 def test_a_bundle_for_no_board_is_signed_for_the_board_it_is_sent_to(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key)
-    folder = bundle(tmp_path / "bundle", signed.content.signed(key), artefacts)
+    folder = write_bundle(tmp_path / "bundle", signed.content.signed(key), artefacts)
     assert code_of(lambda: admission.submit_bundle(store, folder)) == "wrong_board"
     other = SigningKey.generate()
     assert code_of(lambda: admission.submit_bundle(store, folder, other)) == "bad_signature"
-    elsewhere = bundle(
+    elsewhere = write_bundle(
         tmp_path / "other", signed.content.signed(key, Receiver("a" * 64)), artefacts
     )
     assert code_of(lambda: admission.submit_bundle(store, elsewhere, key)) == "wrong_board"

@@ -348,14 +348,6 @@ def test_a_board_keeps_the_description_and_tags_of_its_suite_if_there_are_any():
     assert not [name for name in names if "suite_d" in name]
 
 
-def test_a_bundle_is_accepted_by_the_board_that_it_is_for():
-    make_board()
-    good("init", "other", "--suite", "tiny-v1.json", "--protocol", "small-v1.json")
-    id = make_bundle()
-    assert "wrong_board" in fails(1, "submit", "bundle", "other", "--no-check")
-    assert good("submit", "bundle", "board", "--no-check").strip() == id
-
-
 def test_everything_a_submitter_needs_is_at_the_boards_address(scored):
     with serving(Path("board")) as url:
         Path("policy.onnx").write_bytes(linear_onnx(301))
@@ -376,13 +368,6 @@ def test_everything_a_submitter_needs_is_at_the_boards_address(scored):
         assert "WD regret" in good("show", url, scored)
         remote = json.loads(good("show", url, scored, "--json"))
     assert remote["result"]["scores"]["wd_regret"]["value"] > 0
-
-
-def test_a_board_whose_references_wait_shows_nothing():
-    make_board()
-    assert "reference" in fails(2, "rank", "board")
-    assert "reference" in fails(2, "site", "board")
-    assert not Path("board/site/index.html").exists()
 
 
 def test_score_lists_what_it_could_not_score_and_why_and_counts_its_own(scored):

@@ -87,6 +87,8 @@ def test_content_is_validated_after_its_signature_and_answered_shortly(name):
 @pytest.mark.parametrize(
     ("data", "code"),
     [
+        (b"", "not_json"),
+        (b"\xff\xfe", "not_json"),
         (b"[]", "schema"),
         (b"{}", "bad_signature"),
         (b'{"submission": 1, "signature": "00"}', "schema"),

@@ -38,13 +38,6 @@ def test_slope_is_that_of_the_least_squares_line():
     assert slope == pytest.approx(np.polynomial.Polynomial.fit(LEVELS, regret, 1).convert().coef[1])
 
 
-def test_a_constant_policy_has_no_decay():
-    for levels in (LEVELS, (0.0, 0.1, 0.3, 0.7)):
-        constant = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
-        nothing = dict.fromkeys(("ood_decay", "regret_slope", "similarity_loss"), 0.0)
-        assert constant == {"wd_regret": 1.0, "ood_regret": 1.0, **nothing}
-
-
 # Intervals
 
 

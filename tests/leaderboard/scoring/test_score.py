@@ -234,33 +234,6 @@ def test_a_random_batch_and_the_last_of_each_region_are_checked():
     assert chosen != checks(40, [800, 800, 800, 100])
 
 
-def test_dependence_on_the_batch_in_the_last_one_alone_is_detected():
-    # The rows of the last batch of 8,192 + 500 states: only they see each other.
-    rows = models.tensor("rows", np.float32(500.0))
-    policy = as_bytes(
-        models.squashed(
-            [
-                models.node("Mul", "y zero", "none"),
-                models.node("Add", "none one", "ones"),
-                models.node("ReduceSum", "ones axis", "count", keepdims=1),
-                models.node("Equal", "count rows", "is_last"),
-                models.node("ReduceMean", "y", "mean", axes=[0], keepdims=1),
-                models.node("Sub", "y mean", "other"),
-                models.node("Where", "is_last other y", "a"),
-            ],
-            [
-                rows,
-                models.tensor("zero", np.float32(0.0)),
-                models.tensor("one", np.float32(1.0)),
-                models.tensor("axis", np.array([0], np.int64)),
-            ],
-        )
-    )
-    board = ONE.model_copy(update={"protocol": EvaluationProtocol(states_per_region=8692)})
-    result = score(policy, board=board)
-    assert (result.status, result.code) == ("rejected", "run_batch_dependent")
-
-
 def test_one_policy_in_two_files_is_refused_and_both_runs_are_named():
     zero, one = (models.tensor("number", np.float32(number)) for number in (0.0, 1.0))
     original = as_bytes(models.squashed([models.node("Add", "y number", "a")], [zero]))

@@ -23,11 +23,7 @@ from leaderboard.scoring.worker import background_scorers, run_scorer, run_score
 from leaderboard.store import Store
 from leaderboard.store.queue import Queue
 from sme_registry.errors import MissingDependencyError, OptionError
-from tests.leaderboard.conftest import (
-    document_path,
-    put_submission,
-    tiny_board,
-)
+from tests.leaderboard.conftest import derived, document_path, put_submission, tiny_board
 
 
 def failed_result(document, submission, *arguments, **options):
@@ -286,6 +282,12 @@ def test_scorers_killed_over_a_submission_leave_it_and_the_others_are_scored(
     monkeypatch.setattr(scorer, "score_submission", failed_result)
     assert run_scorer(store.folder.path) == 1
     assert {row.status for row in store.entries()} == {"scored"}
+    assert [each.event for each in store.log()] == ["opened", *["received"] * 2, *["result"] * 2]
+    before = derived(store)
+    store.reindex()
+    assert derived(store) == before
+    with store.transaction() as index:
+        assert index.one("SELECT count(*) FROM lease") == (0,)
 
 
 def assert_ended(pids):
