@@ -20,7 +20,6 @@ class _Commands(CommandGroup):
         "train": (f"{__name__}.train", "Train an agent with its exact regret, and evaluate it."),
         "evaluate": (f"{__name__}.evaluate", "Evaluate a policy in and out of distribution."),
         "diagnose": (f"{__name__}.evaluate", "Show where a policy's regret occurs, and why."),
-        "explore": (f"{__name__}.evaluate", ""),
         "profile": (f"{__name__}.profile", "Show where an algorithm breaks, beside PPO."),
         "study": (f"{__name__}.study", "Compare algorithms on classes of tasks, over seeds."),
         "data": (f"{__name__}.data", "Make data sets for offline RL, of a chosen quality."),
@@ -31,6 +30,7 @@ class _Commands(CommandGroup):
         "validate": "is `sme check` now, which also checks the draw: sme check mine.json.",
         "certify": "is `sme check` now, which also checks the file: sme check mine.json.",
         "dataset": "is `sme data` now: sme data make Default --nu 0.5.",
+        "explore": "is `sme diagnose --explore` now: sme diagnose runs/demo --explore.",
         "offline": "is `sme train --data` now: sme train --data DATASET -a iql.",
     }
 

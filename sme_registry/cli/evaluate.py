@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -373,12 +372,6 @@ def diagnose(
     written = write_atomically(out / _PAGE, text)
     data = result.write(out / _JSON)
     print_written([*figures, written, data])
-
-
-@app.command("explore", hidden=True)
-@functools.wraps(diagnose)
-def explore(**options: Any) -> None:
-    diagnose(**options | {"explore": True})
 
 
 def _write_page(

@@ -9,16 +9,12 @@ from sme_registry.envs.single import SMEEnv
 if TYPE_CHECKING:
     from sme_registry.envs.vector import SMEVectorEnv
 
-    SMEStreamVectorEnv = SMEVectorEnv
-
 __all__ = ["SMEEnv", "SMEVectorEnv"]
-
-SMEStreamEnv = SMEEnv  # this and SMEStreamVectorEnv are names in the `EnvSpec`s that users have
 
 
 def __getattr__(name: str) -> Any:
     # Only on request: a single environment also works with versions of Gymnasium without vectors.
-    if name in ("SMEVectorEnv", "SMEStreamVectorEnv"):
+    if name == "SMEVectorEnv":
         from sme_registry.envs.vector import SMEVectorEnv
 
         return SMEVectorEnv

@@ -315,8 +315,8 @@ class CommandGroup(TyperGroup):
     """Commands that report invalid input as one line on standard error and an exit code.
 
     A command of `modules` is in the `app` of its module, which is imported when it is called; the
-    help shows its summary, in a panel if it has one. Without a summary it is hidden. A former
-    command of `replaced` says in one sentence what replaces it.
+    help shows its summary, in a panel if it has one. A former command of `replaced` says in one
+    sentence what replaces it.
     """
 
     exit_codes: tuple[tuple[type[SMEError], int], ...] = ()  # the first match; else 2
@@ -327,9 +327,8 @@ class CommandGroup(TyperGroup):
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
         for name, (_, summary, *panel) in self.modules.items():
-            self.commands[name] = TyperCommand(
-                name, help=summary, hidden=not summary, rich_help_panel=panel[0] if panel else None
-            )
+            panel_name = panel[0] if panel else None
+            self.commands[name] = TyperCommand(name, help=summary, rich_help_panel=panel_name)
         _arrange_help(self)
 
     def load(self, name: str) -> Any:

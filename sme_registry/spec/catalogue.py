@@ -96,11 +96,6 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     """The file of a name, with or without its version (then the newest)."""
     if newest := _newest(kind, name):
         return cast(_E, _read(kind, spec_folder() / kind.folder / f"{newest}.json"))
-    if Path(name).suffix in POLICY_SUFFIXES:
-        raise UnknownNameError(
-            f"{name!r}: is the file of a policy, not of a {word_of(kind)}. To evaluate it: "
-            f"sme evaluate {name} TASK."
-        )
     for other in Envelope.__subclasses__():
         if _newest(other, name):
             raise UnknownNameError(
@@ -114,12 +109,8 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     raise UnknownNameError(message)
 
 
-POLICY_SUFFIXES = (".zip", ".onnx", ".npz", ".pt", ".pth")
 _USES = {  # of a name of one kind where another is wanted
-    (
-        "suite",
-        "spec",
-    ): "To train on all of its tasks: sme train --suite {0}; for one of them, give "
+    ("suite", "spec"): "To train on all of its tasks: sme train --suite {0}; for one of them, give "
     "its digest from `sme show {0}`.",
     ("spec", "suite"): "To train on it alone: sme train {0}, without --suite. In a suite of your "
     "own: sme new suite.json -t {0}.",

@@ -55,23 +55,8 @@ def test_streams_of_the_catalogue_have_their_ids():
             again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
             assert again.unwrapped.stream == stream
             assert again.spec.id == env_id
-    check_env(gymnasium.make("SME/Switch5-v1").unwrapped)
-
-
-def test_an_env_spec_of_earlier_versions_makes_the_stream():
-    places = {
-        "entry_point": "sme_registry.envs:SMEStreamEnv",
-        "vector_entry_point": "sme_registry.envs:SMEStreamVectorEnv",
-    }
-    kwargs = {"stream": SHORT.to_dict(), "action_range": "symmetric"}
-    text = EnvSpec(id=f"SME/{SHORT.content_name}-v1", **places, kwargs=kwargs).to_json()
-    env, batch = (
-        gymnasium.make(EnvSpec.from_json(text)),
-        gymnasium.make_vec(EnvSpec.from_json(text)),
-    )
-    assert env.unwrapped.stream == batch.unwrapped.stream == SHORT
-    assert env.action_space.low[0] == batch.single_action_space.low[0] == -1.0
     assert not hasattr(gymnasium.make("SME/Default-v1").unwrapped, "stream")
+    check_env(gymnasium.make("SME/Switch5-v1").unwrapped)
 
 
 def test_names_make_single_environments_and_native_batches():

@@ -1,4 +1,4 @@
-"""`sme explore`: what it writes where, what it refuses, and what a page holds."""
+"""`sme diagnose --explore`: what it writes where, what it refuses, and what a page holds."""
 
 import json
 import re
@@ -37,17 +37,18 @@ def here(tmp_path, monkeypatch):
 
 
 def test_a_task_and_a_policy_become_pages(here):
-    good("explore", "small.json")
+    good("diagnose", "--explore", "small.json")
     page = here / "small-explorer.html"
     data = data_of(page)
     assert (data["name"], data["title"], data["digest"]) == (None, "small", SPEC.digest)
     assert [each["name"] for each in data["policies"]] == ["linear", "constant ½"]
-    assert "already exists. Use --force" in " ".join(refused("explore", "small.json").split())
-    good("explore", "small.json", "--set", "k=5", "--force")
+    refusal = refused("diagnose", "--explore", "small.json")
+    assert "already exists. Use --force" in " ".join(refusal.split())
+    good("diagnose", "--explore", "small.json", "--set", "k=5", "--force")
     assert data_of(page)["task"]["k"] == 5
 
     options = ("--task", "small.json", "--out", "a/b.html", "--episodes", "4")
-    good("explore", "actor.npz", *options)
+    good("diagnose", "--explore", "actor.npz", *options)
     data = data_of(here / "a" / "b.html")
     policy = data["policies"][0]
     assert (policy["name"], policy["of"]) == ("actor", "observation")
@@ -77,7 +78,7 @@ def test_a_task_and_a_policy_become_pages(here):
 )
 def test_what_it_refuses(arguments, message, here):
     before = set(here.iterdir())
-    assert message in " ".join(refused("explore", *arguments).split())
+    assert message in " ".join(refused("diagnose", "--explore", *arguments).split())
     assert set(here.iterdir()) == before
 
 
@@ -98,8 +99,8 @@ def test_a_run_has_its_learning_curve_and_its_evaluation(tmp_path):
         protocol=report.protocol, protocol_digest=report.protocol_digest, versions={},
     ).write(tmp_path)  # fmt: skip
 
-    good("explore", tmp_path)
-    good("explore", tmp_path)  # it follows from the run, and is replaced
+    good("diagnose", "--explore", tmp_path)
+    good("diagnose", "--explore", tmp_path)  # it follows from the run, and is replaced
     data = data_of(tmp_path / FILE)
     assert data["name"] == "PPO"
     assert data["policies"][0]["of"] == "observation"

@@ -219,7 +219,7 @@ def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     assert f'<a href="explorers/{explorer.name}">PPO on plane, run 0</a>' in page.read_text()
     assert '"of":"observation"' in explorer.read_text()
     assert '"regions":{"names":["WD"' in explorer.read_text()
-    good("explore", tmp_path, "--cell", result.key, "--out", tmp_path / "one.html")
+    good("diagnose", "--explore", tmp_path, "--cell", result.key, "--out", tmp_path / "one.html")
     assert (tmp_path / "one.html").read_text() == explorer.read_text()
     ledger.model_path(result.key).write_bytes(b"no model")
     text = write_report(tmp_path, formats=["html"], explorers=True)[0].read_text()
