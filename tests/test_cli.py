@@ -131,6 +131,7 @@ def test_a_usage_error_is_one_line_that_points_to_the_help(arguments):
         ("certify Default", "sme check"),
         ("dataset make Default", "sme data make"),
         ("offline train x -a bc", "sme train --data"),
+        ("explore runs/demo", "sme diagnose --explore"),
     ],
 )
 def test_a_command_of_before_says_what_replaces_it(command, instead):

@@ -50,7 +50,6 @@ from sme_registry.task import load
 
 _EVALUATION = "evaluation.json"
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
-_POLICY_FILES = (".zip", ".onnx", ".npz")
 
 app = typer.Typer()
 
@@ -240,7 +239,8 @@ class SubjectOptions:
             if self.cell is not None:
                 return load_cell(what, self.cell)
             return diagnosis.load_run(what)
-        is_policy = what.endswith(_POLICY_FILES) or (":" in what and not what.startswith("sha256:"))
+        is_digest = what.startswith("sha256:")
+        is_policy = what.endswith(catalogue.POLICY_SUFFIXES) or (":" in what and not is_digest)
         if is_policy or not or_task:
             raise OptionError(
                 f"{what!r}: is not a folder. Give a folder of `sme train`; for a policy, add the "
@@ -414,7 +414,8 @@ def _target(what: str, options: SubjectOptions, out: Path | None, *, force: bool
         return check_new(out, force=force)
     if task is None and cell is None and Path(what).is_dir():
         return Path(what) / explorer.FILE
-    name = Path(what).name if os.sep in what or what.endswith(_POLICY_FILES) else what
+    is_file = os.sep in what or what.endswith(catalogue.POLICY_SUFFIXES)
+    name = Path(what).name if is_file else what
     label = "".join(c if c.isalnum() or c in "-_" else "-" for c in name.removesuffix(".json"))
     if cell is not None:
         label += f"-{cell[:12]}"

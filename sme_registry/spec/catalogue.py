@@ -96,6 +96,11 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     """The file of a name, with or without its version (then the newest)."""
     if newest := _newest(kind, name):
         return cast(_E, _read(kind, spec_folder() / kind.folder / f"{newest}.json"))
+    if name.endswith(POLICY_SUFFIXES):
+        raise UnknownNameError(
+            f"{name!r}: is the file of a policy, not of a {word_of(kind)}. To evaluate it: "
+            f"sme evaluate {name} TASK."
+        )
     for other in Envelope.__subclasses__():
         if _newest(other, name):
             raise UnknownNameError(
@@ -109,6 +114,7 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     raise UnknownNameError(message)
 
 
+POLICY_SUFFIXES = (".zip", ".onnx", ".npz", ".pt", ".pth")
 _USES = {  # of a name of one kind where another is wanted
     ("suite", "spec"): "To train on all of its tasks: sme train --suite {0}; for one of them, give "
     "its digest from `sme show {0}`.",
