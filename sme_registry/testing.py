@@ -30,8 +30,9 @@ from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ACTION_RANGES, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task, load, materialize, observe, step
+from sme_registry.task.episode import Step, shaping_at_switch
 from sme_registry.task.loading import materialize_segments
-from sme_registry.task.task import NUMBERS, ON_TOP, Array, Step, shaping_at_switch
+from sme_registry.task.task import NUMBERS, ON_TOP, Array
 from sme_registry.teams import SMETeamEnv, observed_columns
 
 __all__ = ["ConformanceError", "check_env", "check_stream", "check_team"]
@@ -207,7 +208,7 @@ class _Life:
         return self.schedule.life(phase, np.int64(self.lifetime))
 
     def _begin(self, seed: int | None) -> None:
-        self.segment, self.t = self.schedule.segment(self.lifetime), 0
+        self.segment, self.t = self.schedule.times.segment_at(self.lifetime), 0
         observations, info = self.agents.by_agent(self.env.reset(seed=seed))
         expect_equal("the agents of infos at reset", tuple(info), self.agents.names)
         for name, owned in zip(info, self.task.owned, strict=True):
@@ -227,7 +228,7 @@ class _Life:
         self.lifetime, self.t = self.lifetime + 1, self.t + 1
         expect_equal("the next state", self.agents.state, result.state[0])
         within = self.schedule.switches_within
-        later = self.schedule.segment(self.lifetime) if within else self.segment
+        later = self.schedule.times.segment_at(self.lifetime) if within else self.segment
         after = self.schedule.tasks[later]
         self.at_switch = shaping_at_switch(task, after, self.agents.state, self.t)
         for agent, name in enumerate(self.agents.names):

@@ -18,7 +18,8 @@ from sme_registry.errors import FingerprintMismatchError
 from sme_registry.evaluation.regions import expansion
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task, step
-from sme_registry.task.task import Array, Indices, Mask, Observation, Step
+from sme_registry.task.episode import Step
+from sme_registry.task.task import Array, Indices, Mask, Observation
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -197,17 +198,16 @@ def _expected(
     columns: Arrays, task: Task, t: Indices, ends: Indices
 ) -> dict[str, tuple[npt.NDArray[Any], float | Array]]:
     """What a task gives for the rows of a data set, `[N, …]`, and with which tolerance."""
-    spec, s, a = task.spec, columns["states"], columns["actions"].astype(np.float64)
+    spec, a = task.spec, columns["actions"].astype(np.float64)
     result = _steps(task, columns, t, ends)
-    step_reward, optimal = result.step_reward, result.optimal_action
     starts = np.repeat(t[[0, *ends[:-1]]], np.diff(ends, prepend=0))
     of_reward = spec.k * np.where(starts == 0, TOLERANCE, _ROUNDED)[:, None]
     expected: dict[str, tuple[npt.NDArray[Any], float | Array]] = {
         "next_states": (result.state, 0.0),
-        "optimal_actions": (optimal, TOLERANCE),
+        "optimal_actions": (result.optimal_action, TOLERANCE),
         "similarities": (result.similarity, TOLERANCE),
-        "step_rewards": (step_reward, TOLERANCE),
-        "regrets": (1.0 - step_reward, TOLERANCE),
+        "step_rewards": (result.step_reward, TOLERANCE),
+        "regrets": (result.regret, TOLERANCE),
         "terminations": (result.terminated[:, None], 0.0),
         "rewards" if spec.team is None else "agent_rewards": (result.reward, of_reward),
     }
@@ -221,13 +221,11 @@ def _expected(
         of_seen[-1] = 0.0  # of t/T, which no mixing touches
         expected[f"{which}observations"] = seen, of_seen
     if spec.safety is not None:
-        limit = task.limit(s)
-        safe_reward = task.safe_reward_of(optimal, limit)[:, None]
         expected |= {
-            "limits": (limit, TOLERANCE),
-            "safe_actions": (np.minimum(optimal, limit), TOLERANCE),
-            "costs": (task.cost_of(a, limit)[:, None], TOLERANCE),
-            "safe_regrets": (safe_reward - step_reward, TOLERANCE),
+            "limits": (result.limit, TOLERANCE),
+            "safe_actions": (result.safe_action, TOLERANCE),
+            "costs": (result.cost, TOLERANCE),
+            "safe_regrets": (result.safe_regret, TOLERANCE),
         }
     if spec.distractors:
         d, moved = columns["distractors"], columns["next_distractors"]

@@ -21,6 +21,7 @@ from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import Task
 from sme_registry.task.engine import Engine, StepMany, engine
+from sme_registry.task.episode import shaping_at_switch
 from sme_registry.task.loading import check_memory
 from sme_registry.task.task import (
     ACCUMULATED_REWARD,
@@ -32,7 +33,6 @@ from sme_registry.task.task import (
     Mask,
     Observation,
     own_rows,
-    shaping_at_switch,
 )
 
 _FLOAT64 = np.dtype(np.float64)
@@ -345,10 +345,10 @@ class Batch:
         over = envs[self._lifetime[envs] >= self._next_switch[envs]]
         if over.size:
             lifetimes, which = np.unique(self._lifetime[over], return_inverse=True)
-            segments = [self.schedule.segment(lifetime) for lifetime in lifetimes.tolist()]
-            switches = [self.schedule.next_switch(lifetime) for lifetime in lifetimes.tolist()]
-            self._segment[over] = np.array(segments)[which]
-            self._next_switch[over] = np.array(switches)[which]
+            times = self.schedule.times
+            segments = np.array([times.segment_at(lifetime) for lifetime in lifetimes.tolist()])
+            switches = np.array([times.next_switch(lifetime) for lifetime in lifetimes.tolist()])
+            self._segment[over], self._next_switch[over] = segments[which], switches[which]
             self._put_in_force()
 
     def _pay_switch(self, envs: Indices, before: Indices, result: BatchStep) -> None:

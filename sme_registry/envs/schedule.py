@@ -86,7 +86,7 @@ class Schedule:
         self.switches_within = document.switch == "step"
         optional = ("lifetime", self.is_stream), ("distractors", tasks[0].spec.distractors > 0)
         self.reset_options = ("state", *(name for name, exists in optional if exists))
-        self._times = document.times
+        self.times = document.times
         self._one_hot = np.eye(self.phases[-1] + 1, document.observed_phases, dtype=np.float32)
 
     @classmethod
@@ -110,14 +110,6 @@ class Schedule:
         tasks = materialize_segments(*resolved)
         arguments.single_agent(tasks[0])
         return cls(resolved.document, tasks)
-
-    def segment(self, lifetime: int) -> int:
-        """The segment in force after so many environment steps; the last one at the end."""
-        return self._times.segment_at(lifetime)
-
-    def next_switch(self, lifetime: int) -> int:
-        """The lifetime at which that segment is over; NEVER in the last one of the life."""
-        return self._times.next_switch(lifetime)
 
     def one_hot(self, phase: int | Indices) -> Observation:
         """What an observation in a phase ends with, `[…, P]`."""

@@ -20,6 +20,7 @@ from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
 from sme_registry.task.engine import engine
+from sme_registry.task.episode import shaping_at_switch
 from sme_registry.task.task import (
     ACCUMULATED_REWARD,
     BUFFER_STATE,
@@ -29,7 +30,6 @@ from sme_registry.task.task import (
     Array,
     Indices,
     Observation,
-    shaping_at_switch,
 )
 
 _FLOAT32, _FLOAT64 = np.dtype(np.float32), np.dtype(np.float64)
@@ -218,14 +218,14 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             lifetime = int(self._lifetimes[-1]) - 1
         else:
             self._look_ahead(lifetime)
-        self._enter(self._schedule.segment(lifetime))
+        self._enter(self._schedule.times.segment_at(lifetime))
         return self._schedule.life(self._phase, np.int64(lifetime))
 
     def _look_ahead(self, lifetime: int) -> None:
         """Fill the lifetimes of the next steps: those until a switch, or the next few."""
         stop = lifetime + _AHEAD
         if self._schedule.switches_within:
-            stop = min(stop, self._schedule.next_switch(lifetime))
+            stop = min(stop, self._schedule.times.next_switch(lifetime))
         self._lifetimes[:] = np.arange(stop, lifetime, -1)
 
     def _enter(self, segment: int) -> None:
@@ -370,7 +370,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         added = 0.0
         if self._schedule.switches_within:
             before = self.task
-            self._enter(self._schedule.segment(lifetime))
+            self._enter(self._schedule.times.segment_at(lifetime))
             S = self.document.state_dim
             waiting = self._numbers[BUFFER_VALUES + ACCUMULATED_REWARD] / self.sme_spec.k
             observation[S + 1], observation[S + 2 :] = min(waiting, 1.0), self._one_hot

@@ -1,77 +1,36 @@
 """Files, checks of arguments, and the machine; terminal, tables and markup are imported by name."""
 
-from sme_registry.io.files import (
-    TEMPORARY,
-    Arrays,
-    Lock,
-    atomic_file,
-    build_folder,
-    check_new,
-    check_writable,
-    claim_folder,
-    file_lock,
-    is_locked,
-    is_regular,
-    open_regular,
-    parse_json,
-    read_arrays,
-    read_json,
-    read_regular,
-    sha256_of,
-    sync_folder,
-    temporary_beside,
-    to_json,
-    write_arrays,
-    write_atomically,
-)
-from sme_registry.io.system import (
-    available_memory,
-    choice,
-    import_object,
-    install_command,
-    integer_in,
-    is_installed,
-    missing_dependency,
-    number_in,
-    require_packages,
-    server_address,
-    versions,
-    visible,
-)
-
-__all__ = [
-    "TEMPORARY",
-    "Arrays",
-    "Lock",
-    "atomic_file",
-    "available_memory",
-    "build_folder",
-    "check_new",
-    "check_writable",
-    "choice",
-    "claim_folder",
-    "file_lock",
-    "import_object",
-    "install_command",
-    "integer_in",
-    "is_installed",
-    "is_locked",
-    "is_regular",
-    "missing_dependency",
-    "number_in",
-    "open_regular",
-    "parse_json",
-    "read_arrays",
-    "read_json",
-    "read_regular",
-    "require_packages",
-    "server_address",
-    "sha256_of",
-    "sync_folder",
-    "temporary_beside",
-    "to_json",
-    "versions",
-    "visible",
-    "write_arrays",
-    "write_atomically",
-]
+from sme_registry.io.files import TEMPORARY as TEMPORARY
+from sme_registry.io.files import Arrays as Arrays
+from sme_registry.io.files import Lock as Lock
+from sme_registry.io.files import atomic_file as atomic_file
+from sme_registry.io.files import build_folder as build_folder
+from sme_registry.io.files import check_new as check_new
+from sme_registry.io.files import check_writable as check_writable
+from sme_registry.io.files import claim_folder as claim_folder
+from sme_registry.io.files import file_lock as file_lock
+from sme_registry.io.files import is_locked as is_locked
+from sme_registry.io.files import is_regular as is_regular
+from sme_registry.io.files import open_regular as open_regular
+from sme_registry.io.files import parse_json as parse_json
+from sme_registry.io.files import read_arrays as read_arrays
+from sme_registry.io.files import read_json as read_json
+from sme_registry.io.files import read_regular as read_regular
+from sme_registry.io.files import sha256_of as sha256_of
+from sme_registry.io.files import sync_folder as sync_folder
+from sme_registry.io.files import temporary_beside as temporary_beside
+from sme_registry.io.files import to_json as to_json
+from sme_registry.io.files import write_arrays as write_arrays
+from sme_registry.io.files import write_atomically as write_atomically
+from sme_registry.io.system import available_memory as available_memory
+from sme_registry.io.system import choice as choice
+from sme_registry.io.system import import_object as import_object
+from sme_registry.io.system import install_command as install_command
+from sme_registry.io.system import integer_in as integer_in
+from sme_registry.io.system import is_installed as is_installed
+from sme_registry.io.system import missing_dependency as missing_dependency
+from sme_registry.io.system import number_in as number_in
+from sme_registry.io.system import require_packages as require_packages
+from sme_registry.io.system import server_address as server_address
+from sme_registry.io.system import versions as versions
+from sme_registry.io.system import visible as visible

@@ -231,14 +231,6 @@ def _check_is_file(kind: type[Envelope], data: dict[str, Any], source: str, reme
             f"{source}: {'is a bare ' + kind.content + ': ' if is_bare else ''}digest: missing: "
             f"must be the digest of the {kind.content}. To add it, {remedy}."
         )
-    lacking = {"fingerprint", "fingerprints"} & (kind.model_fields.keys() - data.keys())
-    if lacking and kind.content in data:
-        raise MalformedDocumentError(
-            f"{source}: {min(lacking)}: missing: must be the numbers drawn from the "
-            f"{kind.content}. To add it, save the {kind.content} again, in Python `sme_registry"
-            f".save(sme_registry.{document.__name__}.from_dict(data[{kind.content!r}]), path)` "
-            "with the parsed JSON as data."
-        )
     others = [other for other in Envelope.__subclasses__() if other.content in data]
     if others and kind.content not in data:
         raise SpecError(

@@ -149,7 +149,8 @@ class _Evaluations(Watch):
         number = k + cell.evaluations - len(self.record.due)  # a function has only the last
         states = start_states(cell.seed, number, cell.evaluation_episodes, cell.spec.state_dim)
         # On the task of the last step, or that of the first.
-        segment, phases = self._schedule.segment(max(steps - 1, 0)), cell.document.observed_phases
+        segment = self._schedule.times.segment_at(max(steps - 1, 0))
+        phases = cell.document.observed_phases
         if phases:
             assert isinstance(policy, Policy)  # streams have no teams
             policy = policy.in_phase(int(self._schedule.phases[segment]), phases)

@@ -67,35 +67,20 @@ class Backend:
     """The learners of one prefix of `uses`: a new back-end is a module, and a row of `BACKENDS`.
 
     Functions and classes are `module:name`, and imported when they are needed.
-
-    Attributes:
-      settings: a function of a learner's name, and what errors call that, to the model of its
-        hyperparameters.
-      learns: what it can be trained on.
-      learner: its `Learner`; empty for what a study runs in another way.
-      names: its learners; empty where each name is one.
-      check: a function that raises for a task or stream that it cannot learn for another reason.
-      several: whether it learns in several environments at once.
-      one_thread: whether PyTorch has one thread meanwhile.
-      title: whose implementation of the same algorithms it is: it is a value of `agents` then.
-      device: a function from the name of a device, or None, to the one that it computes on.
-      in_programs: whether a study runs its cells in shared programs; see `studies.programs`.
-      own_checkpoint: whether only it reads its checkpoints, which are no models.
-      packages: those whose versions its numbers depend on too.
     """
 
-    settings: str
+    settings: str  # from a learner's name, and what errors call it, to its hyperparameters' model
     learns: tuple[Kind, ...]
-    learner: str = ""
-    names: tuple[str, ...] = ()
-    check: str = ""
-    several: bool = False
-    one_thread: bool = False
-    title: str = ""
-    device: str = ""
-    in_programs: bool = False
-    own_checkpoint: bool = False
-    packages: tuple[str, ...] = ()
+    learner: str = ""  # its `Learner`; empty for what a study runs in another way
+    names: tuple[str, ...] = ()  # its learners; empty where each name is one
+    check: str = ""  # raises for a task or stream that it cannot learn for another reason
+    several: bool = False  # whether it learns in several environments at once
+    one_thread: bool = False  # whether PyTorch has one thread meanwhile
+    title: str = ""  # whose implementation of the same algorithms it is: then a value of `agents`
+    device: str = ""  # from the name of a device, or None, to the one that it computes on
+    in_programs: bool = False  # whether its cells share programs; see `studies.programs`
+    own_checkpoint: bool = False  # whether only it reads its checkpoints, which are no models
+    packages: tuple[str, ...] = ()  # whose versions its numbers depend on too
 
 
 _HERE = "sme_registry.training"

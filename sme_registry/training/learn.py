@@ -86,26 +86,15 @@ class Watch:
 
 
 class Learner:
-    """What learns in environments of its own: of Stable-Baselines3, in JAX, or a function.
+    """What learns in environments of its own: of Stable-Baselines3, in JAX, or a function."""
 
-    Attributes:
-      steps: environment steps so far.
-      total: environment steps at the end; on-policy algorithms collect whole rollouts.
-      hyperparameters: those that differ from the defaults.
-      source: the digest of the source of the code that learns, if that is part of a cell.
-      seconds: CPU seconds in its environments, if they are known.
-      only_at_the_end: whether it has no policy before.
-      yields_policies: whether it has another policy only where it calls `Watch.on_policy`.
-      model: the trained policy, as `evaluate` takes it.
-    """
-
-    source: str | None = None
-    seconds: Any = 0.0
-    only_at_the_end = False
-    yields_policies = False
-    steps: Any
-    total: Any
-    model: Any
+    source: str | None = None  # the digest of the code that learns, if that is part of a cell
+    seconds: Any = 0.0  # of the CPU in its environments, if they are known
+    only_at_the_end = False  # whether it has no policy before
+    yields_policies = False  # whether it has another policy only where it calls `on_policy`
+    steps: Any  # of the environments so far
+    total: Any  # at the end; on-policy algorithms collect whole rollouts
+    model: Any  # the trained policy, as `evaluate` takes it
 
     def __init__(self, name: str, run: Run) -> None:
         self.name, self.run = name, run

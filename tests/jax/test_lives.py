@@ -22,8 +22,8 @@ from sme_registry.jax.task import check_supported
 from sme_registry.jax.td3_sac import TD3, TD3Program
 from sme_registry.spec import StreamSpec
 from sme_registry.task import observe, step
+from sme_registry.task.episode import shaping_at_switch
 from sme_registry.task.loading import materialize_segments
-from sme_registry.task.task import shaping_at_switch
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
