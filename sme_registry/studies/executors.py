@@ -85,7 +85,7 @@ class Executor(ABC):
     @property
     def workers(self) -> int:
         """Jobs that can run at once."""
-        return available_cores() if self._jobs is None else self._jobs
+        return self._jobs or available_cores()
 
     def _session(self) -> AbstractContextManager[None]:
         """Open what jobs run in; leaving it ends those that are still running."""
@@ -125,9 +125,9 @@ _END = object()
 
 def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
     """Run a job; an exception becomes the failure of its cells, so that the process goes on."""
-    report, unfinished = _throttled(progress), {cell.digest: cell for cell in job.cells}
+    unfinished = {cell.digest: cell for cell in job.cells}
     try:
-        for outcome in _outcomes(run, job, keep_models, report):
+        for outcome in _outcomes(run, job, keep_models, _throttled(progress)):
             del unfinished[outcome.entry.key]
             yield outcome
     except (Exception, SystemExit) as error:
@@ -264,7 +264,6 @@ class _JobProcess:
 
 
 def _child(pipe: Any, run: RunCell, job: Job, keep_models: bool, log: Path) -> None:
-    """Run one job: the main function of its process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     # Studies run for days, and many machines remove old files from the temporary folder.
@@ -294,10 +293,8 @@ class OnRay(Executor):
     @property
     def workers(self) -> int:
         """Jobs that can run at once: `jobs`, else the cluster's cores as of now."""
-        if self._jobs is not None:
-            return self._jobs
-        if not self._ray.is_initialized():
-            return available_cores()
+        if self._jobs or not self._ray.is_initialized():
+            return super().workers
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     @contextlib.contextmanager

@@ -17,7 +17,7 @@ import hashlib
 import json
 import os
 import warnings
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -168,11 +168,11 @@ class Ledger:
                 return path, keys
         return None
 
-    def remove_states(self, ended: Path) -> None:
+    def remove_states(self) -> None:
         """Remove the states of which every cell has a result: a retry goes on from the others."""
         for path in self._states():
             keys = read_header(path).get("cells", [])
-            if all(self._path(CELLS, key).exists() for key in keys) and (keys or path == ended):
+            if all(self._path(CELLS, key).exists() for key in keys):
                 path.unlink(missing_ok=True)
 
     def _states(self) -> list[Path]:
@@ -306,10 +306,9 @@ class StudyStatus:
     @property
     def counts(self) -> dict[tuple[str, str], Counter[State]]:
         """(class, algorithm) → number of cells in each state, in the plan's order."""
-        counts: dict[tuple[str, str], Counter[State]] = {}
+        counts: dict[tuple[str, str], Counter[State]] = defaultdict(Counter)
         for cell in self.places:
-            group = cell.planned.class_name, cell.planned.algorithm
-            counts.setdefault(group, Counter())[cell.state] += 1
+            counts[cell.planned.class_name, cell.planned.algorithm][cell.state] += 1
         return counts
 
     def to_dict(self) -> dict[str, Any]:
@@ -335,7 +334,7 @@ class StudyStatus:
                     "error": cell.failure.error,
                     "attempts": cell.failure.attempts,
                 }
-                for cell in self.failed
+                for cell in self.cells
                 if cell.failure is not None
             ],
         }
@@ -344,10 +343,9 @@ class StudyStatus:
 def requested(ledger: Ledger, file: StudyFile) -> set[str]:
     """Digests of the cells of each class and algorithm of which a run has finished or failed."""
     ended = ledger.results().keys() | ledger.failures().keys()
-    groups: dict[tuple[str, str], set[str]] = {}
+    groups: dict[tuple[str, str], set[str]] = defaultdict(set)
     for planned in file.plan.cells:
-        group = planned.class_name, planned.algorithm
-        groups.setdefault(group, set()).add(planned.cell.digest)
+        groups[planned.class_name, planned.algorithm].add(planned.cell.digest)
     return {key for keys in groups.values() if keys & ended for key in keys}
 
 

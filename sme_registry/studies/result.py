@@ -160,13 +160,14 @@ class CellResult(StrictModel):
             del fields["online_cost"]
         return fields
 
-    def _repr_html_(self) -> str:
-        """The report's table, for notebooks."""
-        return self.any_report._repr_html_()
 
-
-def with_fresh(report: StreamReport, fresh: Sequence[CellResult]) -> StreamReport:
-    """The report of a life with its fresh agents, one for each phase."""
+def report_of_life(life: CellResult, results: Mapping[str, CellResult]) -> StreamReport:
+    """The report of a life, with its fresh agents once all of them have finished."""
+    report = life.stream_report
+    assert report is not None
+    fresh = [results[cell.digest] for cell in life.cell.fresh if cell.digest in results]
+    if not fresh or len(fresh) < len(life.cell.fresh):
+        return report
     costs = [result.online_regret for result in fresh if result.online_regret is not None]
     known = len(costs) == len(fresh) and report.dynamic_regret is not None
     return report.with_fresh([result.any_report for result in fresh], costs if known else None)

@@ -194,8 +194,8 @@ class Queue:
         self._count(entry)
         if any(cell.digest in self._running for cell in job.cells):
             return None
-        if job.program is not None and job.program.state is not None:
-            self._ledger.remove_states(job.program.state)
+        if job.program is not None:
+            self._ledger.remove_states()
         return job
 
     def release(self) -> None:

@@ -25,7 +25,7 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.io import read_json
 from sme_registry.spec.study import Cell
 from sme_registry.studies.ledger import CELLS, Ledger
-from sme_registry.studies.result import CellResult, LearningCurve, with_fresh
+from sme_registry.studies.result import CellResult, LearningCurve, report_of_life
 from sme_registry.training.algorithms import parse_uses
 from sme_registry.training.record import Snapshots
 
@@ -81,18 +81,13 @@ def find_result(study: str | Path, key: str) -> CellResult:
 
 def _life(name: str, result: CellResult, ledger: Ledger, known: dict[str, Any]) -> StreamSubject:
     """A life, with its fresh agents once all of them have finished."""
-    cell, report = result.cell, result.stream_report
+    cell = result.cell
     assert cell.stream is not None
-    assert report is not None
     kept = Snapshots(ledger.snapshots_path(result.key), cell.stream)
     networks, initial = networks_of(kept, cell.stream, cell.action_range)
-    finished = ledger.results(agent.digest for agent in cell.fresh)
-    fresh = [finished[agent.digest] for agent in cell.fresh if agent.digest in finished]
-    if fresh and len(fresh) == len(cell.fresh):
-        report = with_fresh(report, fresh)
     return StreamSubject(
         name,
-        report,
+        report_of_life(result, ledger.results(agent.digest for agent in cell.fresh)),
         networks=networks,
         initial_network=initial,
         fresh_networks=tuple(

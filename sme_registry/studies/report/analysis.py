@@ -179,11 +179,6 @@ class Analysis:
         """How many runs have finished or are missing; `--only` may have left out others."""
         return self.planned - self._counts["left out"]
 
-    @property
-    def seconds(self) -> float:
-        """CPU time of all finished runs."""
-        return sum(result.timing.total for result in self.cells.values())
-
 
 class TableMaker(NamedTuple):
     """A table of every study with its kind of runs; of those with rows if `optional`."""

@@ -105,7 +105,7 @@ from sme_registry.spec.cards import BLOCKS, fields_of_block, number_type
 from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.design import metrics_of
-from sme_registry.studies.result import CellResult, with_fresh
+from sme_registry.studies.result import CellResult, report_of_life
 
 RUN = ["class_name", "algorithm", "run"]
 RUN_COLUMNS = "class_name:str algorithm:str run:int64 "  # columns of `RUN`, for `frame`
@@ -174,13 +174,6 @@ class StudyFrames(NamedTuple):
 
     results: pd.DataFrame
     curves: pd.DataFrame
-
-    def __repr__(self) -> str:
-        return f"<StudyFrames: results {self.results.shape}, curves {self.curves.shape}>"
-
-    def _repr_html_(self) -> str:
-        frames = self._asdict().items()
-        return "".join(f"<h4>{name}</h4>{frame.to_html(max_rows=10)}" for name, frame in frames)
 
 
 def load(folder: str | os.PathLike[str]) -> StudyFrames:
@@ -400,12 +393,8 @@ def finished_lives(plan: StudyPlan, results: Mapping[str, CellResult]) -> list[F
     for planned in ordered(plan):
         result = results.get(planned.cell.digest)
         if planned.phase is None and result is not None and result.stream_report is not None:
-            fresh = [results.get(cell.digest) for cell in planned.cell.fresh]
-            finished = [agent for agent in fresh if agent is not None]
-            report = result.stream_report
-            if fresh and len(finished) == len(fresh):
-                report = with_fresh(report, finished)
-            lives.append(FinishedLife(planned, result, report, len(finished)))
+            fresh = sum(cell.digest in results for cell in planned.cell.fresh)
+            lives.append(FinishedLife(planned, result, report_of_life(result, results), fresh))
     return lives
 
 

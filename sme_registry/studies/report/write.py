@@ -19,6 +19,7 @@ figures is inverted, except for maps, whose lightness carries meaning.
 from __future__ import annotations
 
 import base64
+import contextlib
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,8 +35,7 @@ from sme_registry.io import check_writable, choice, to_json, write_atomically
 from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
 from sme_registry.plots.style import WRITTEN
-from sme_registry.spec import StudyFile
-from sme_registry.studies.ledger import REPORT, Ledger, label, requested
+from sme_registry.studies.ledger import REPORT, Ledger, requested
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.design import metrics_of
 from sme_registry.studies.report.figures import (
@@ -49,7 +49,7 @@ from sme_registry.studies.report.findings import THRESHOLDS, findings
 from sme_registry.studies.report.frames import StudyFrames, frame, load, records, runs_of
 from sme_registry.studies.report.tables import DIFFERENCES, analyse, differences
 from sme_registry.studies.report.texts import TextTable, comparison_tables, csv_tables, text_tables
-from sme_registry.studies.subject import find_result, load_cell
+from sme_registry.studies.subject import load_cell
 
 DEFAULT_METRICS = tuple(metric.key for metric in metrics_of("score"))  # of comparisons
 FORMATS = ("html", "png", "pdf", "csv", "latex")
@@ -125,7 +125,7 @@ def write_report(
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
     analysis = analyse(file, results, failures, requested=requested(ledger, file), models=models)
-    pages = explorers_of(ledger, file, models) if explorers else []
+    pages = explorers_of(ledger.folder, analysis) if explorers else []
     contents = _contents(analysis, formats, pages, full=full)
     return [write_atomically(target / name, content) for name, content in contents.items()]
 
@@ -272,7 +272,8 @@ def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
     yield "plan", file.digest, file.versioned_name
     yield "protocol", plan.protocol.digest, states
     runs = f"{analysis.finished:,} of {plural(analysis.requested, 'run')}"
-    yield "runs", "", f"{runs} finished, in {duration(analysis.seconds)} of CPU time"
+    seconds = sum(result.timing.total for result in analysis.cells.values())
+    yield "runs", "", f"{runs} finished, in {duration(seconds)} of CPU time"
     episodes = plural(plan.evaluation_episodes, "episode")
     yield "evaluations", "", f"{plan.evaluations:,} during training, {episodes} each"
     for algorithm in plan.algorithms:
@@ -296,21 +297,16 @@ def listed(values: Mapping[str, Any], between: str = " ") -> str:
     return ", ".join(f"{name}{between}{value}" for name, value in sorted(values.items()))
 
 
-def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) -> list[Explorer]:
+def explorers_of(folder: Path, analysis: Analysis) -> list[Explorer]:
     """A page for each run on a single task whose model was kept, in the plan's order."""
-    pages: dict[str, Explorer] = {}
-    for planned in file.plan.cells:
-        key = planned.cell.digest
-        if planned.in_stream or key not in models or key in pages:
-            continue
-        name = key.removeprefix("sha256:")[:_DIGITS]
-        try:
-            report = find_result(ledger.folder, key).report
-            content = explorer_page(facts(load_cell(ledger.folder, key), report=report))
-        except SMEError:
-            continue
-        pages[key] = Explorer(label(planned), f"explorers/{name}.html", content)
-    return list(pages.values())
+    pages = []
+    for place in analysis.places[~analysis.places.streams].drop_duplicates("key").itertuples():
+        if place.key in analysis.models:
+            name, report = place.key.removeprefix("sha256:"), analysis.cells[place.key].report
+            with contextlib.suppress(SMEError):
+                content = explorer_page(facts(load_cell(folder, place.key), report=report))
+                pages.append(Explorer(place.label, f"explorers/{name[:_DIGITS]}.html", content))
+    return pages
 
 
 def compare(
