@@ -68,13 +68,7 @@ class ProfileRow(StrictModel):
 
 
 class ProfileFailure(StrictModel):
-    """A run that raised an error.
-
-    Attributes:
-      class_name: the level.
-      run: the number of the draw.
-      error: the message.
-    """
+    """A run that raised an error, by its level and the number of its draw."""
 
     class_name: str
     run: Integer

@@ -119,7 +119,6 @@ class Analysis:
     coloured: tuple[str, ...]
     groups: tuple[Group, ...]
     runs: pd.DataFrame
-    offline_runs: pd.DataFrame
     lives: tuple[FinishedLife, ...]
     reference_costs: Mapping[tuple[str, str], Sequence[DynamicRegret]]
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)

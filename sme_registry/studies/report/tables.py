@@ -136,11 +136,11 @@ def analyse(
     classes = class_infos(plan)
     present = [a for a in plan.algorithms if a.name in set(runs.algorithm)]
     names = tuple(algorithm.name for algorithm in present)
-    keys = [c.cell.digest for c in plan.cells if c.in_stream and c.cell.digest in finished]
+    places = _places(plan, finished, errors or {}, requested)
     analysis = Analysis(
         file=file,
-        cells={key: finished[key] for key in (*runs.key, *keys)},
-        places=_places(plan, finished, errors or {}, requested),
+        cells={key: finished[key] for key in places.key if key in finished},
+        places=places,
         models=models or {},
         bootstrap=Bootstrap(file.digest, draws),
         classes=classes,
@@ -150,7 +150,6 @@ def analyse(
         coloured=_learners(coloured or plan.algorithms),
         groups=groups(classes, names, set(by_place(runs))),
         runs=runs,
-        offline_runs=offline_runs(results, plan.algorithms),
         lives=lives,
         reference_costs=reference_costs(lives),
         tables={"results": results, "curves": curves}
@@ -446,7 +445,7 @@ def _iqm(values: Any) -> float:
     optional=True,
 )
 def _offline(analysis: Analysis) -> Iterator[dict[str, Any]]:
-    runs = analysis.offline_runs
+    runs = offline_runs(analysis.tables["results"], analysis.plan.algorithms)
     intervals = summary(
         runs, ["nu"], metrics_of("data"), analysis.bootstrap,
         lambda name, learner, _, nu: ("offline", learner, name, f"{nu:g}"),

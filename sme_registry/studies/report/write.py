@@ -139,8 +139,7 @@ def _contents(
     figures, absent = draw_figures(analysis, figure_formats) if figure_formats else ([], [])
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
-        rows = findings(analysis)
-        contents["index.html"] = page(analysis, rows, figures, absent, tables, explorers)
+        contents["index.html"] = page(analysis, figures, absent, tables, explorers)
     for ending in ("png", "pdf"):
         if ending in formats and figures:
             contents[f"figure.{ending}"] = _main_figure(analysis, figures).files[ending]
@@ -204,13 +203,13 @@ def _every_file(
 
 def page(
     analysis: Analysis,
-    rows: pd.DataFrame,
-    figures: Sequence[Picture],
-    absent: Sequence[str],
-    tables: Sequence[TextTable],
+    figures: Sequence[Picture] = (),
+    absent: Sequence[str] = (),
+    tables: Sequence[TextTable] = (),
     explorers: Sequence[Explorer] = (),
 ) -> str:
     """The whole page; `absent` has a sentence for each figure that could not be drawn."""
+    rows = findings(analysis)
     by_section = {
         key: [figure for figure in figures if figure.name.startswith(prefixes)]
         for key, (_, prefixes) in _SECTIONS.items()

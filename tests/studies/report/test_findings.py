@@ -161,7 +161,7 @@ def test_different_training_steps_are_reported(analysis):
 
 def text_of(analysis, *reasons):
     """What a reader sees of the page."""
-    text = page(analysis, findings(analysis), [], reasons, [])
+    text = page(analysis, absent=reasons)
     body = re.sub("</?(code|strong)>", "", text[text.index("<main>") :])
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
 

@@ -68,7 +68,7 @@ def streams(study):
 
 def text_of(analysis):
     """The text of the page, without figures and tables."""
-    return Page(page(analysis, findings(analysis), [], [], [])).text
+    return Page(page(analysis)).text
 
 
 def found(analysis, **at):
