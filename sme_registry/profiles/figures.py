@@ -30,13 +30,13 @@ _LEAST = -0.6  # robustness
 def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, Look]:
     """The profile in front; a method of several discounts has one colour. The constant has none."""
     methods = [other.name.partition(" (")[0] for other in others if other.learns]
-    numbered = numbered_looks(dict.fromkeys(("", *COMPARED, *methods)), dashes=["-"])
-    looks = {profile.name: numbered[""]}
+    numbered = numbered_looks(dict.fromkeys(("", *COMPARED, *methods)))
+    solid, hollow = {"linestyle": "-"}, {"linestyle": (0, (2, 1.5)), "markerfacecolor": "none"}
+    looks: dict[str, Look] = {profile.name: {**numbered[""], **solid}}
     for other in others:
         method, _, variant = other.name.partition(" (")
         if other.learns:
-            hollow = {"linestyle": (0, (2, 1.5)), "markerfacecolor": "none"} if variant else {}
-            looks[other.name] = {**numbered[method], **hollow}
+            looks[other.name] = {**numbered[method], **(hollow if variant else solid)}
         elif other.name == "linear":
             looks[other.name] = LINEAR
     return looks

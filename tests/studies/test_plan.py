@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.errors import UnknownNameError
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan, catalogue
 from sme_registry.studies.budget import Estimator, in_implementation, scaled, selected
 from sme_registry.studies.cell import run_cell
@@ -90,8 +90,6 @@ class TestScaled:
         assert {cell.algorithm for cell in found} == {"PPO", "TD3"}
         assert len(found) == 5 * 2 * 10
         assert selected(ABLATIONS.plan.cells) == ABLATIONS.plan.cells
-        with pytest.raises(OptionError, match="class=GLOB"):
-            selected(ABLATIONS.plan.cells, ["constant"])
 
 
 class TestEstimate:
@@ -205,9 +203,6 @@ class TestCommands:
     def test_bad_input_is_one_line_and_writes_nothing(self, command, words, tmp_path):
         assert words in refused(*command.split())
         assert list(tmp_path.iterdir()) == []
-
-    def test_an_unknown_option_is_not_taken_for_a_hyperparameter_without_an_algorithm(self):
-        assert "VALUE" not in refused("sweep", "-t", "Default", "-a", "PPO", "--log-x")
 
 
 class TestAgents:
@@ -331,17 +326,7 @@ class TestEdited:
         assert words in refused("new", "new.json", "--from", "edited.json", *option.split(" "))
         assert not Path("new.json").exists()
 
-    @pytest.mark.parametrize(
-        ("text", "words"),
-        [
-            ("[]", "must be a valid dictionary"),
-            ('{"classes": [}', "edited.json"),
-            ('{"seeds": 3}', "algorithms: missing"),
-        ],
-    )
-    def test_what_is_no_plan_is_refused(self, text, words):
-        Path("edited.json").write_text(text)
-        result = commands.sme("study", "new", "new.json", "--from", "edited.json")
-        assert result.exit_code == 2
-        assert words in result.stderr
+    def test_what_is_no_plan_is_refused(self):
+        Path("edited.json").write_text("[]")
+        assert "must be a valid dictionary" in refused("new", "new.json", "--from", "edited.json")
         assert not Path("new.json").exists()

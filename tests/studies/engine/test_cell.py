@@ -277,10 +277,3 @@ def test_cells_have_limits_and_distractors_and_repeat_to_the_bit(uses):
     assert (again.curve, again.report) == (done.curve, done.report)
     assert done.report.safety is not None
     assert done.report.observation is not None
-
-
-def test_more_noise_makes_worse_data_and_other_cells():
-    noisy, clean = run_cell(offline(nu=1.0)), run_cell(offline(nu=0.0))
-    assert noisy.key != clean.key
-    assert clean.offline.behaviour_similarity == pytest.approx(1.0)
-    assert noisy.offline.behaviour_similarity < 0.97

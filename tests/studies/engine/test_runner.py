@@ -280,15 +280,6 @@ def test_of_an_edited_plan_only_the_new_cells_are_run(study, notes):
     assert len(cells.starts(notes)) == 6
 
 
-def test_only_the_selected_cells_are_run_and_the_others_are_apart(study):
-    file = small_file(seeds=2, algorithms=("optimal", "constant"))
-    status, _ = quick(file, study, only=["algorithm=opt*"])
-    assert {cell.planned.algorithm for cell in status.cells} == {"optimal"}
-    assert Ledger(study).plan_file() == file
-    assert study_status(study, ["algorithm=constant"]).count("waiting") == 2
-    assert study_status(study).count("waiting") == 2
-
-
 def test_on_a_full_disk_it_stops_with_a_typed_error_and_loses_nothing(study, tmp_path):
     plan, small = tmp_path / "plan.json", small_file(seeds=2)
     small.write(plan)
@@ -391,7 +382,6 @@ def test_a_result_of_another_cell_is_a_failure(study):
     [
         ({"executor": "threads"}, UnknownNameError, "must be 'processes', 'in-process' or 'ray'"),
         ({"only": ["class"]}, OptionError, "class=GLOB"),
-        ({"only": ["algorithm=constnat"]}, UnknownNameError, "Did you mean 'constant'"),
         ({"device": "cpu"}, OptionError, "^device=.*no cell to run has one. Leave it out, or"),
         ({"lanes": 3}, OptionError, "^lanes=.*no cell to run has one. Leave it out, or"),
     ],

@@ -3,7 +3,6 @@
 import re
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from sme_registry import statistics
@@ -182,14 +181,6 @@ def test_curves_are_the_median_over_runs_then_smoothed(study):
 @pytest.mark.parametrize(("evaluations", "width"), [(1, 1), (40, 4), (100, 10), (400, 10)])
 def test_the_window_is_at_most_ten_evaluations(evaluations, width):
     assert window(evaluations) == width
-
-
-def test_the_same_results_give_the_same_tables(study, finished):
-    file, results, analysis = study
-    errors = {key: failure.error for key, failure in Ledger(finished).failures().items()}
-    again = analyse(file, dict(reversed(results.items())), errors)
-    for table in TABLES:
-        pd.testing.assert_frame_equal(again.tables[table], analysis.tables[table], rtol=0)
 
 
 def test_without_results_the_tables_are_empty_and_without_the_first_class_the_contrasts(

@@ -244,7 +244,9 @@ def draw_learning_curves(analysis: Analysis) -> Drawn:
 
 
 def _group_curves(analysis: Analysis, group: Group, rows: pd.DataFrame) -> Figure:
-    looks = panels.numbered_looks(group.classes, colours=shades(len(group.classes)))
+    numbered = panels.numbered_looks(group.classes).items()
+    coloured = zip(numbered, shades(len(numbered)), strict=True)
+    looks = {name: {**look, "color": colour} for (name, look), colour in coloured}
     data = training_data(analysis.runs)
 
     def draw_curve(axes: Axes, place: tuple[str, str]) -> None:
@@ -268,8 +270,7 @@ def draw_offline(analysis: Analysis) -> Drawn:
     rows = analysis.tables["offline"]
     if rows.empty:
         return
-    dashes = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (8, 2)))
-    looks = panels.numbered_looks(dict.fromkeys(rows.learner), dashes=dashes)
+    looks = panels.numbered_looks(dict.fromkeys(rows.learner))
     references = {"behaviour policy": _BEHAVIOUR, "optimum": _OPTIMUM, "constant ½": CONSTANT}
     across = min(3, rows.class_name.nunique())
     figure = panel_grid(

@@ -7,6 +7,7 @@ standard deviation over the mean. So 1, 2, 5, 10 and 2, 4, 8 are, and 0.25, 0.5,
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -80,16 +81,10 @@ def looks_of(analysis: Analysis, names: Iterable[str] | None = None) -> dict[str
     return {name: look for name, look in looks.items() if name in present}
 
 
-def numbered_looks(
-    names: Iterable[str], colours: Sequence[Any] = COLOURS, dashes: Sequence[Any] = DASHES
-) -> dict[str, Look]:
+def numbered_looks(names: Iterable[str]) -> dict[str, Look]:
     """A look for each name, in order; each list is taken from its beginning again after its end."""
-    return {
-        name: new_look(
-            colours[i % len(colours)], MARKERS[i % len(MARKERS)], dashes[i % len(dashes)]
-        )
-        for i, name in enumerate(names)
-    }
+    looks = zip(itertools.cycle(COLOURS), itertools.cycle(MARKERS), itertools.cycle(DASHES))
+    return {name: new_look(*look) for name, look in zip(names, looks, strict=False)}
 
 
 def panel_grid(
