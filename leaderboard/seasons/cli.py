@@ -344,20 +344,18 @@ def table_regret(setting: Setting, rows: int) -> float:
     It is the mean over public tasks of this setting, of the better of the nearest state's optimum
     and the mean of the eight nearest ones. Labels are exact, so data with noise do worse.
     """
-    return float(np.mean([_regret(setting, rows, seed) for seed in _SEEDS]))
-
-
-def _regret(setting: Setting, rows: int, seed: int) -> float:
     from scipy.spatial import cKDTree
 
-    task = materialize(SMESpec.from_dict({**setting.to_dict(), "seed": seed}))
-    random = np.random.default_rng(seed)
-    states = random.random((min(rows, MOST_ROWS), setting.state_dim))
-    asked = random.random((_QUESTIONS, setting.state_dim))
-    labels, optimum = task.optimal_action(states), task.optimal_action(asked)
-    tree = cKDTree(states)
-    errors = []
-    for count in _NEIGHBOURS:
-        _, nearest = tree.query(asked, range(1, min(count, len(states)) + 1))
-        errors.append(np.abs(labels[nearest].mean(axis=1) - optimum).mean())
-    return float(min(errors) / np.abs(0.5 - optimum).mean())
+    regrets = []
+    for seed in _SEEDS:
+        task = materialize(SMESpec.from_dict({**setting.to_dict(), "seed": seed}))
+        random = np.random.default_rng(seed)
+        states = random.random((min(rows, MOST_ROWS), setting.state_dim))
+        asked = random.random((_QUESTIONS, setting.state_dim))
+        labels, optimum = task.optimal_action(states), task.optimal_action(asked)
+        tree, errors = cKDTree(states), []
+        for count in _NEIGHBOURS:
+            _, nearest = tree.query(asked, range(1, min(count, len(states)) + 1))
+            errors.append(np.abs(labels[nearest].mean(axis=1) - optimum).mean())
+        regrets.append(min(errors) / np.abs(0.5 - optimum).mean())
+    return float(np.mean(regrets))

@@ -9,6 +9,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 from rich.markup import escape
 
@@ -47,7 +48,8 @@ from sme_registry.io.markup import Table, plural
 from sme_registry.io.terminal import Progress, err, out
 from sme_registry.seasons import WITHOUT_TASK, Instance, Ticket, actions_in, prepare_policy
 from sme_registry.seasons.transcript import Signer
-from sme_registry.seasons.wire import Hidden, TicketClass, pack_table, tickets_path, unpack_table
+from sme_registry.seasons.wire import pack_table, tickets_path, unpack_table
+from sme_registry.spec import Setting
 
 app = typer.Typer()
 
@@ -202,8 +204,6 @@ def answer(
 
       sme-leaderboard answer https://board.example ticket.json 'actions/{name}.npy'
     """
-    import numpy as np
-
     if (policy is None) == (challenges is None):
         raise OptionError("POLICY, --challenges: one of the two must be given.")
     held = Ticket.read(ticket_file)
@@ -222,11 +222,13 @@ def answer(
             )
         _write_challenges(url, held, {name: places[name] for name in chosen}, challenges)
         return
+    assert policy is not None  # one of the two is given
     # All are loaded before the first instance's steps end for good.
-    own = {} if policy is None else policy_of_each(policy, chosen)
     policies = {
-        places[name]: _prepared(each, held.place(places[name]), action_range, algorithm)
-        for name, each in own.items()
+        places[name]: _prepared(
+            each, held.place(places[name]).member.setting, action_range, algorithm
+        )
+        for name, each in policy_of_each(policy, chosen).items()
     }
     blind = [name for name in stepped if isinstance(policies[places[name]], np.ndarray)]
     if blind:
@@ -256,18 +258,15 @@ def answer(
 
 
 def _prepared(
-    policy: str, place: Hidden[TicketClass], action_range: str | None, algorithm: str | None
+    policy: str, setting: Setting, action_range: str | None, algorithm: str | None = None
 ) -> Any:
-    """A policy, or the array of actions in a file."""
-
-    setting, given = place.member.setting, answers_in(policy)
-    if given is not None:
-        return unpack_table(given, setting.action_dim)
+    """A policy, or the array of actions in an .npy file."""
+    if policy.endswith(".npy"):
+        return unpack_table(read_file(Path(policy)), setting.action_dim)
     return prepare_policy(policy, setting, action_range=action_range, algorithm=algorithm)
 
 
 def _write_challenges(url: str, ticket: Ticket, places: dict[str, int], folder: Path) -> None:
-
     check_writable(folder / "challenge.npy")
     with Progress("writing", len(places), console=err(), unit="challenges") as progress:
         for done, (name, number) in enumerate(places.items(), start=1):
@@ -318,16 +317,19 @@ def enter(
         if name not in hidden:
             raise OptionError(f"failed={name!r}: must be one of {', '.join(hidden)}.")
     policies = policy_of_each(policy, hidden)
-    files: list[bytes | None] = []
+    files: dict[str, bytes] = {}
     with Progress("answering", len(hidden), console=err(), unit="instances") as progress:
         for done, (name, setting) in enumerate(hidden.items(), start=1):
-            states = published / "challenges" / f"{name}.npy"
-            files.append(
-                None if name in without else _answers(policies[name], states, setting, action_range)
-            )
+            if name not in without:
+                prepared = _prepared(policies[name], setting, action_range)
+                if not isinstance(prepared, np.ndarray):
+                    states = read_file(published / "challenges" / f"{name}.npy")
+                    shown = unpack_table(states, setting.state_dim + 2)
+                    prepared = actions_in(shown, prepared, setting)
+                files[name] = pack_table(prepared)
             progress.update(done)
-    digests = [None if data is None else sha256_of(data) for data in files]
-    data = {name: each for name, each in zip(digests, files, strict=True) if name and each}
+    named = {name: {"sha256": sha256_of(data), "size": len(data)} for name, data in files.items()}
+    answers = {sha256_of(data): data for data in files.values()}
     entry = Entry.from_dict(
         {
             **manifest_fields(
@@ -335,37 +337,26 @@ def enter(
                 *(submitter, code, statement),
             ),
             "season": season.digest,
-            "answers": [name and {"sha256": name, "size": len(data[name])} for name in digests],
+            "answers": [named.get(name) for name in hidden],
         }
     )
     signed = entry.signed(signing_key, receiver_of(board))
     if is_url(board):
-        path, answers = f"/api/seasons/{season.id}/entries", data.__getitem__
+        path, read = f"/api/seasons/{season.id}/entries", answers.__getitem__
         with (
-            Progress("uploading", len(data), console=err(), unit="answers") as progress,
+            Progress("uploading", len(answers), console=err(), unit="answers") as progress,
             ServedBoard(board) as served,
         ):
-            served.send(path, signed, data, answers, signing_key, progress.update_of)
+            served.send(path, signed, answers, read, signing_key, progress.update_of)
     else:
         with SeasonStore.open(Path(board)) as store:
-            enter_folder(store, signed, answers=data.__getitem__)
+            enter_folder(store, signed, answers=answers.__getitem__)
     out().print(signed.id, soft_wrap=True)
     err().print(
         f"The season closes at {season.closes}; until then a later entry of "
         f"{escape(method)} replaces this one.",
         soft_wrap=True,
     )
-
-
-def _answers(policy: str, states: Path, setting: Any, action_range: str | None) -> bytes:
-    """The file of answers: the given one, or a policy's actions in the challenge states."""
-
-    given = answers_in(policy)
-    if given is not None:
-        return given
-    prepared = prepare_policy(policy, setting, action_range=action_range)
-    shown = unpack_table(read_file(states), setting.state_dim + 2)
-    return pack_table(actions_in(shown, prepared, setting))
 
 
 def served_season(url: str, id: str) -> tuple[str, Receiver]:
@@ -404,11 +395,6 @@ def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
             f"{next(iter(names))}: each task has a policy of its own."
         )
     return {name: policy.replace("{name}", name) for name in names}
-
-
-def answers_in(path: str) -> bytes | None:
-    """The bytes of a file of actions, if a policy is given by one; None for other policies."""
-    return read_file(Path(path)) if path.endswith(".npy") else None
 
 
 def read_file(path: Path) -> bytes:

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, NoReturn
 
 from leaderboard.documents.result import RunScore
 from leaderboard.errors import BoardError, TamperedError
@@ -205,31 +205,6 @@ def _refuse_other_digest(path: Path, found: str, expected: str) -> None:
         )
 
 
-def follows(
-    instance: HiddenTask, master: Master, expected: Digests, folder: Path | None = None
-) -> Literal["exactly", "within rounding", "unknown", "no"]:
-    """Whether what was published of an instance is what the master gives when generated again.
-
-    Where digests differ, as other processors and versions of NumPy may round otherwise, data sets
-    are compared, if `folder` is a copy of all that was published: otherwise it is unknown.
-    """
-    data, states = _generate(instance, master)
-    if sha256_of(states) != expected.challenge:
-        return "no"
-    if expected.data in (data.digest, data.rounded().digest):  # in seasons before float32 the first
-        return "exactly"
-    if folder is None:
-        return "unknown"
-    path = dataset_path(folder, instance.place.season, instance.hidden)
-    published = SealedDataset.read(path)
-    _refuse_other_digest(path, published.digest, expected.data)
-    return "within rounding" if data.agrees_with(published) else "no"
-
-
-def _generate(instance: HiddenTask, master: Master) -> tuple[SealedDataset, bytes]:
-    return SealedDataset.collect(recipe(instance, master)), instance.challenge
-
-
 def recipe(instance: HiddenTask, master: Master) -> DatasetRecipe:
     """What the data set of an instance is generated from; secret until the reveal."""
     data = instance.hidden.member.data
@@ -245,9 +220,8 @@ def recipe(instance: HiddenTask, master: Master) -> DatasetRecipe:
 
 
 def _publish(instance: HiddenTask, season: str, master: Master, folder: Path) -> Digests:
-    hidden = instance.hidden
-    data, states = _generate(instance, master)
-    data = data.rounded()
+    hidden, states = instance.hidden, instance.challenge
+    data = SealedDataset.collect(recipe(instance, master)).rounded()
     data.write(_dataset_id(season, hidden), folder / "datasets")
     path = challenge_path(folder, hidden)
     path.parent.mkdir(exist_ok=True)
@@ -291,12 +265,13 @@ class _SeasonVerifier:
         self.is_online = self.season.track == "sealed-online"
 
     def check(self) -> None:
-        self.check_ends()
         for row in self.entrants:
             self.check_signature(row)
+            if self.is_online and row.result is not None and row.policies < row.runs:
+                self.refuse_early(row, "without all answers")
         self.report("signatures of entrants", len(self.entrants))
         for result in filter(None, map(self.store.sealed_result, self.entrants)):
-            refuse_contradiction(self.contradiction(result), self.name(result.subject))
+            refuse_contradiction(self.contradiction(result), f"{self.of.id}, {result.subject}")
         if self.of.reveal is None:
             self.check_published()
             count = len(self.entrants)
@@ -309,21 +284,11 @@ class _SeasonVerifier:
     def report(self, what: str, checked: int, unchecked: int = 0, why: str = "") -> None:
         self.findings.report(f"{self.of.id}: {what}", checked, unchecked, why)
 
-    def name(self, subject: str) -> str:
-        """What to call an entry or ticket, by its id."""
-        return f"{self.of.id}, {subject}"
-
     def check_signature(self, row: SealedRow) -> None:
         """Check an entrant's signature, which the board's own key cannot forge."""
         signed = self.store.request_of(row) if self.is_online else self.store.entry_of(row)
         if not signed.is_valid(self.store.document.key):
             self.refuse(row, "its signature does not match the entrant's key")
-
-    def check_ends(self) -> None:
-        """Check that no ticket ended early; all else that is forbidden no log can have."""
-        for row in self.entrants if self.is_online else ():
-            if row.result is not None and row.policies < row.runs:
-                self.refuse_early(row, "without all answers")
 
     def refuse_early(self, row: SealedRow, lack: str) -> None:
         """Refuse a ticket that ended before its deadline, though something is lacking."""
@@ -346,24 +311,44 @@ class _SeasonVerifier:
         self.report("data sets, by their digests", check_published(self.season, folder))
 
     def generate_again(self, master: Master) -> None:
+        """Compare what was published with what the master gives."""
         if not self.season.published:
             return
         outcomes: Counter[str] = Counter()
         for instance, expected in zip(
             instances(self.season, master), self.season.published, strict=True
         ):
-            outcome = follows(instance, master, expected, self.published())
-            if outcome == "no":
-                where = f"{self.of.id}: published {expected.class_name} {expected.instance}"
-                message = "its data set or challenge states do not follow from the master"
-                raise TamperedError(where, message)
-            outcomes[outcome] += 1
+            outcomes[self.outcome(instance, master, expected)] += 1
             self.findings.progress(f"{expected.class_name} {expected.instance}")
         why = "this processor rounds otherwise, and the published arrays are not here"
         unknown, rounded = outcomes["unknown"], outcomes["within rounding"]
         self.report("data sets", outcomes["exactly"], unknown, why * bool(unknown))
         if rounded:
             self.report("data sets, within 1e-6", rounded, 0, "this processor rounds otherwise")
+
+    def outcome(self, instance: HiddenTask, master: Master, expected: Digests) -> str:
+        """How what was published of an instance follows from the master.
+
+        Where digests differ, as other processors and versions of NumPy may round otherwise, data
+        sets are compared, if they are here.
+        """
+        data, folder = SealedDataset.collect(recipe(instance, master)), self.published()
+        follows = sha256_of(instance.challenge) == expected.challenge
+        if follows and expected.data in (data.digest, data.rounded().digest):
+            return "exactly"  # the first in seasons before float32
+        if follows and folder is None:
+            return "unknown"
+        if follows and folder is not None:
+            path = dataset_path(folder, self.season.id, instance.hidden)
+            published = SealedDataset.read(path)
+            _refuse_other_digest(path, published.digest, expected.data)
+            follows = data.agrees_with(published)
+        if not follows:
+            raise TamperedError(
+                f"{self.of.id}: published {expected.class_name} {expected.instance}",
+                "its data set or challenge states do not follow from the master",
+            )
+        return "within rounding"
 
     def score_again(self, master: Master) -> None:
         counted = counting(self.store, self.season)
@@ -375,7 +360,7 @@ class _SeasonVerifier:
         left = sum(row.result is None for row in counted)
         self.findings.compare(
             (
-                (self.name(row.id), self.store.sealed_result(row), here)
+                (f"{self.of.id}, {row.id}", self.store.sealed_result(row), here)
                 for row, here in zip(whole, self.scored(master, whole), strict=True)
             ),
             (left, "not scored yet: repeat `sme-leaderboard season reveal`"),

@@ -55,7 +55,6 @@ from leaderboard.seasons.season import (
 from leaderboard.seasons.store import SealedRow, SeasonStore
 from leaderboard.web.tables import row_facts
 from sme_registry import EvaluationProtocol, SMESpec
-from sme_registry.errors import PolicyError
 from sme_registry.evaluation import (
     EvaluationReport,
     as_policy,
@@ -122,47 +121,36 @@ def score_runs(
 
     Its optimum takes most of the time. No answers score 1 in every metric.
     """
-    name = instance.hidden.member.name
-    replies = [None if answers is None else _Replies(answers) for answers, _ in answered]
+    name, spec = instance.hidden.member.name, instance.spec
     policies = [
-        (as_policy(each, instance.spec, action_range="unit", name="answers"), instance.spec)
-        for each in replies
-        if each is not None
+        (as_policy(_policy(answers), spec, action_range="unit", name="answers"), spec)
+        for answers, _ in answered
+        if answers is not None
     ]
     reports = iter(evaluate_many(policies, instance.protocol))
     scores: list[tuple[RunScore, dict[str, str]]] = []
-    for each, (_, digest) in zip(replies, answered, strict=True):
-        if each is None:
+    for answers, digest in answered:
+        if answers is None:
             scores.append((failed_run(instance.protocol, name, None), {}))
             continue
         report = next(reports)
-        if isinstance(report, PolicyError):
-            raise report
-        each.refuse_unused()
+        assert isinstance(report, EvaluationReport)  # the answers are finite
         run = scored_run(report, name, digest, rules, spec=None, evaluation_seed=None)
-        scores.append((run, _versions(report)))
+        used = {each: report.versions[each] for each in report.versions if each not in _UNUSED}
+        scores.append((run, used))
     return scores
 
 
-def _versions(report: EvaluationReport) -> dict[str, str]:
-    return {name: version for name, version in report.versions.items() if name not in _UNUSED}
-
-
-class _Replies:
+def _policy(answers: Float32) -> Callable[[Float32], Float32]:
     """A policy that returns rows of actions `[N, A]` in order, as many as it is shown states."""
+    shown = 0
 
-    def __init__(self, answers: Float32) -> None:
-        self._answers = answers
-        self._next = 0
+    def policy(observations: Float32) -> Float32:
+        nonlocal shown
+        first, shown = shown, shown + len(observations)
+        return answers[first:shown]
 
-    def __call__(self, observations: Float32) -> Float32:
-        first, self._next = self._next, self._next + len(observations)
-        return self._answers[first : self._next]
-
-    def refuse_unused(self) -> None:
-        """Raise ValueError unless each row was returned once."""
-        if self._next != len(self._answers):
-            raise ValueError(f"{len(self._answers)} answers to {self._next} challenge states")
+    return policy
 
 
 def sealed_result(
@@ -284,24 +272,18 @@ def scored_entries(
     store: SeasonStore, season: Season, master: Master, rows: Sequence[SealedRow]
 ) -> Iterator[SealedResult]:
     """The results of offline entries, from their answers, in order; several at a time."""
+    draws, rules = store.document.draws, store.document.rules
     for first in range(0, len(rows), _AT_A_TIME):
-        yield from _scored_at_once(store, season, master, rows[first : first + _AT_A_TIME])
-
-
-def _scored_at_once(
-    store: SeasonStore, season: Season, master: Master, rows: Sequence[SealedRow]
-) -> Iterator[SealedResult]:
-    answers = [store.entry_of(row).content.answers for row in rows]
-    runs: list[list[RunScore]] = [[] for _ in rows]
-    versions: list[dict[str, str]] = [{} for _ in rows]
-    for number, instance in enumerate(instances(season, master)):
-        answered = [_read(store, instance, of[number]) for of in answers]
-        for entry, (run, used) in enumerate(score_runs(instance, answered, store.document.rules)):
-            runs[entry].append(run)
-            versions[entry] |= used
-    for row, of_entry, used in zip(rows, runs, versions, strict=True):
-        draws, rules = store.document.draws, store.document.rules
-        yield sealed_result(season, row.id, of_entry, used, draws, rules=rules)
+        batch = rows[first : first + _AT_A_TIME]
+        answers = [store.entry_of(row).content.answers for row in batch]
+        scores = [
+            score_runs(instance, [_read(store, instance, of[number]) for of in answers], rules)
+            for number, instance in enumerate(instances(season, master))
+        ]
+        for row, scored in zip(batch, zip(*scores, strict=True), strict=True):
+            versions = {name: used[name] for _, used in scored for name in used}
+            runs = [run for run, _ in scored]
+            yield sealed_result(season, row.id, runs, versions, draws, rules=rules)
 
 
 def _read(store: SeasonStore, instance: HiddenTask, answer: Artefact | None) -> Answered:
