@@ -18,12 +18,12 @@ import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from leaderboard.documents.signed import Signed, verifies
+from leaderboard.documents.signed import Signable, Signed, verifies
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.seasons.journal import Journal, Play, no_steps
 from leaderboard.seasons.scoring import Answered, HiddenTask
@@ -45,10 +45,61 @@ from sme_registry.seasons.wire import InstanceStatus, table_bytes
 from sme_registry.spec.document import Document
 
 SignedHead = Signed[InstanceHead]
+_Kind = TypeVar("_Kind", bound=Signable)
 Phase = Literal["waiting", "stepping", "answering", "answered"]
-_MAX_SIGNED, _MAX_SNAPSHOT = 4096, 2**24
+_MAX_SIGNED, _MAX_SNAPSHOT = 2**20, 2**24  # an end names a thousand heads
 _QUICK_PRODUCTS = 2**23
 """Of weights and lanes, in steps short enough for the event loop: a few milliseconds."""
+
+
+class SignedFile(Generic[_Kind]):
+    """The file of a ticket in which its entrant has signed a document."""
+
+    def __init__(
+        self, path: Path, kind: type[Signed[_Kind]], request: Signed[TicketRequest]
+    ) -> None:
+        self.path, self._kind, self._request = path, kind, request
+
+    @property
+    def digest(self) -> str | None:
+        """Of the file; None where there is none."""
+        return io.sha256_of(read_regular(self.path, _MAX_SIGNED)) if self.path.exists() else None
+
+    def read(self) -> Signed[_Kind] | None:
+        """What it has; None where there is nothing to read."""
+        try:
+            data = read_regular(self.path, _MAX_SIGNED)
+            return self._kind.from_dict(io.parse_json(data, self.path.name))
+        except (OSError, SMEError):
+            return None
+
+    def is_of(self, document: Document) -> bool:
+        """Whether the entrant has signed this document in it."""
+        signed = self.read()
+        return (
+            signed is not None
+            and signed.id == document.digest
+            and self._verifies(document, signed.signature)
+        )
+
+    def with_signature(self, document: _Kind, signature: str, what: str) -> bytes:
+        """Its bytes once a document is signed; a `Rejection` unless the entrant has signed it."""
+        if not self._verifies(document, signature):
+            raise Rejection(
+                "bad_signature",
+                f"signature={signature[:16]!a}: must be of {what}, by the key that the request for "
+                "the ticket names. Use the ticket's file, and the transcripts beside it.",
+            )
+        receiver = self._request.receiver._asdict()
+        return self._kind(content=document, signature=signature, **receiver).to_bytes()
+
+    def tampered(self, what: str) -> TamperedError:
+        where = "/".join(self.path.parts[-5:])
+        return TamperedError(where, f"is not the entrant's signature of {what}")
+
+    def _verifies(self, document: Document, signature: str) -> bool:
+        key, receiver = self._request.content.answers_key, self._request.receiver
+        return key is not None and verifies(key, signature, "answers", document.digest, receiver)
 
 
 class Instance:
@@ -75,16 +126,14 @@ class Instance:
         self.budget = member.budget
         self._hidden, self._check_running = hidden, check_running
         name = folder / str(chain.instance)
-        self._journal_path, self._answers_path = (
-            name.with_suffix(".journal"),
-            name.with_suffix(".npy"),
-        )
-        self._signed_path, self._snapshot_path = name.with_suffix(".json"), name.with_suffix(".npz")
+        self._journal_path = name.with_suffix(".journal")
+        self._answers_path = name.with_suffix(".npy")
+        self._signature = SignedFile(name.with_suffix(".json"), SignedHead, request)
+        self._snapshot_path = name.with_suffix(".npz")
         self._challenge_path = name.with_suffix(".challenge")
         self._lock = threading.RLock()
         self._journal: Journal | None = None
         self._play: Play | None = None
-        self._answered: bool | None = None  # unknown
 
     @property
     def status(self) -> InstanceStatus:
@@ -118,31 +167,15 @@ class Instance:
     def answered(self) -> bool:
         """Whether its answers are stored, with the entrant's signature where that is required."""
         with self._lock:
-            if self._answered is None:
-                self._answered = self._answers_path.exists()
-                if self._answered and not self._is_old:
-                    signed, journal = self.signed, self.journal
-                    hashes = None if signed is None else signed.content.hashes
-                    self._answered = journal is not None and hashes == journal.requests + 2
-            return self._answered
+            if self._is_old or not self._answers_path.exists():
+                return self._answers_path.exists()
+            signed, journal = self.signed, self.journal
+            return bool(signed and journal and signed.content.hashes == journal.requests + 2)
 
     @property
     def signed(self) -> SignedHead | None:
         """What the entrant has signed last; None where there is nothing to read."""
-        try:
-            data = read_regular(self._signed_path, _MAX_SIGNED)
-            return SignedHead.from_dict(io.parse_json(data, self._signed_path.name))
-        except (OSError, SMEError):
-            return None
-
-    @property
-    def signed_digest(self) -> str | None:
-        """The digest of the file with the entrant's signature; None where there is none."""
-        if self._is_old and not self.answered:
-            return None
-        with contextlib.suppress(OSError):
-            return io.sha256_of(read_regular(self._signed_path, _MAX_SIGNED))
-        return None
+        return self._signature.read()
 
     @property
     def answers(self) -> Answered:
@@ -256,11 +289,8 @@ class Instance:
             head = answers_head(challenge_head(play.head, states), data)
             signed = self._signed(play.requests + 2, head, signature)
             write_whole(self._answers_path, data)
-            try:
-                write_whole(self._signed_path, signed.to_bytes())
-                io.sync_folder(self._answers_path.parent)
-            finally:  # the file may be there even if the folder could not be synced
-                self._answered = None
+            write_whole(self._signature.path, signed)
+            io.sync_folder(self._answers_path.parent)
             self.release()
             return True
 
@@ -271,7 +301,8 @@ class Instance:
 
     def stepping(self) -> Stepping:
         """The regret of the steps that the entrant has signed, which are taken again."""
-        signed, digest = self.signed, self.signed_digest
+        signed, is_stated = self.signed, self.answered or not self._is_old
+        digest = self._signature.digest if is_stated else None
         if not self._journal_path.exists():
             return no_steps(self.budget)
         journal = Journal.open(self._journal_path)
@@ -290,33 +321,23 @@ class Instance:
         if self._is_old:
             is_right = not answers or self._has_stated(journal, answers)
         elif signed is None:
-            is_right = not self._signed_path.exists()
+            is_right = not self._signature.path.exists()
         else:
             head, number = play.head, signed.content.hashes
             if number > journal.requests:
                 head = answers_head(challenge_head(head, self._hidden().challenge), answers)
-            is_right = signed.id == self._chain.at(number, head).digest and has_signed(
-                self._request, signed.signature, signed.content
-            )
+            is_right = self._signature.is_of(self._chain.at(number, head))
         if not is_right:
-            where = "/".join(self._signed_path.parts[-5:])
-            raise TamperedError(where, "is not the entrant's signature of this transcript")
+            raise self._signature.tampered("this transcript")
 
     def _has_stated(self, journal: Journal, answers: bytes) -> bool:
         """Whether the entrant has signed answers and journal, before there were transcripts."""
         if self._request.content.answers_key is None:
             return True
-        try:
-            data = read_regular(self._signed_path, _MAX_SIGNED)
-            stored = Signed[Answers].from_dict(io.parse_json(data, self._signed_path.name))
-        except (OSError, SMEError):
-            return False
-        bodies = b"".join(journal.bodies())
-        digests = io.sha256_of(answers), io.sha256_of(bodies)
+        digests = io.sha256_of(answers), io.sha256_of(b"".join(journal.bodies()))
         statement = Answers(**dict(self._chain), answers=digests[0], journal=digests[1])
-        return stored.content == statement and has_signed(
-            self._request, stored.signature, statement
-        )
+        file = SignedFile(self._signature.path, Signed[Answers], self._request)
+        return file.is_of(statement)
 
     def sync(self) -> None:
         """Make the steps taken survive a loss of power; raises OSError if the disk fails."""
@@ -366,23 +387,14 @@ class Instance:
         signed = self._signed(play.requests, play.head, signature)
         with storage():
             self.sync()
-            write_whole(self._signed_path, signed.to_bytes())
+            write_whole(self._signature.path, signed)
             write_whole(self._snapshot_path, play.snapshot())
 
-    def _signed(self, number: int, head: bytes, signature: str) -> SignedHead:
-        document = self._chain.at(number, head)
-        if not has_signed(self._request, signature, document):
-            raise Rejection(
-                "bad_signature",
-                f"signature={signature[:16]!a}: must be of the transcript after {number} requests, "
-                f"whose hash is {document.head[:19]}… here, by the key that the request for the "
-                "ticket names. Use the ticket's file, and the transcripts beside it.",
-            )
-        return SignedHead(
-            content=InstanceHead(**dict(document)),
-            signature=signature,
-            **self._request.receiver._asdict(),
-        )
+    def _signed(self, number: int, head: bytes, signature: str) -> bytes:
+        """The file with the entrant's signature of so many requests, whose hash is the head."""
+        document = InstanceHead(**dict(self._chain.at(number, head)))
+        what = f"the transcript after {number} requests, whose hash is {document.head[:19]}… here"
+        return self._signature.with_signature(document, signature, what)
 
     def _started(self) -> Journal:
         """The journal, or a rejection before the start."""
@@ -413,14 +425,6 @@ class Instance:
                 f"steps: {journal.steps} of {self.budget} are taken, and {journal.lanes} more do "
                 "not fit. Answer the challenge.",
             )
-
-
-def has_signed(request: Signed[TicketRequest], signature: str, document: Document) -> bool:
-    """Whether the key that a request names has signed a document of its ticket."""
-    key = request.content.answers_key
-    return key is not None and verifies(
-        key, signature, "answers", document.digest, request.receiver
-    )
 
 
 def _is_due(play: Play) -> bool:

@@ -28,12 +28,11 @@ from pathlib import Path
 
 from leaderboard.admission import check_entrant, check_manifest, uploader
 from leaderboard.documents.board import check_receiver
-from leaderboard.documents.signed import MAX_BYTES, Signed
+from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import shifted, utc
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.scoring.ranking import failed_run
 from leaderboard.scoring.worker import beside
-from leaderboard.seasons.instance import Instance, has_signed, storage, write_whole
+from leaderboard.seasons.instance import Instance, SignedFile, storage, write_whole
 from leaderboard.seasons.journal import played_bytes
 from leaderboard.seasons.scoring import HiddenTask, score_runs, sealed_result
 from leaderboard.seasons.season import (
@@ -48,8 +47,7 @@ from leaderboard.seasons.season import (
 from leaderboard.seasons.store import SealedRow, SeasonStore
 from leaderboard.store import Store
 from sme_registry import seasons
-from sme_registry.errors import SMEError
-from sme_registry.io import file_lock, parse_json, read_regular, sha256_of
+from sme_registry.io import file_lock
 from sme_registry.seasons.transcript import Chain
 from sme_registry.seasons.wire import StepFormat, TicketStatus
 
@@ -74,7 +72,7 @@ class Ticket:
         self.deadline = deadline(season, row)
         self._closed = row.result is not None
         folder = store.ticket_folder(row.track, row.number)
-        self._end_path = folder / "end.json"
+        self.signed_end = SignedFile(folder / "end.json", Signed[AllHeads], request)
         self._hidden = tuple(season.hidden)
         self.instances = tuple(
             Instance(
@@ -113,7 +111,7 @@ class Ticket:
 
     def is_over(self, now: str) -> bool:
         """Whether nothing can change any more, at a time of the board."""
-        return self._closed or now >= self.deadline or self._end_path.exists()
+        return self._closed or now >= self.deadline or self.signed_end.path.exists()
 
     def check_running(self) -> None:
         """Raise `Rejection` (`ticket_ended`) if the ticket is over, or older than transcripts."""
@@ -127,19 +125,12 @@ class Ticket:
 
     def end(self, signature: str) -> None:
         """End the ticket, all of which is answered, with a signature of all transcripts."""
-        heads = self._heads
-        if not has_signed(self._request, signature, heads):
-            raise Rejection(
-                "bad_signature",
-                f"signature={signature[:16]!a}: must be of the transcripts of all instances. Use "
-                "the ticket's file, and the transcripts beside it.",
-            )
-        if not self._end_path.exists():
+        what = "the transcripts of all instances"
+        data = self.signed_end.with_signature(self._heads, signature, what)
+        if not self.signed_end.path.exists():
             self.check_running()
-            receiver = self._request.receiver._asdict()
-            signed = Signed[AllHeads](content=heads, signature=signature, **receiver)
             with storage():
-                write_whole(self._end_path, signed.to_bytes())
+                write_whole(self.signed_end.path, data)
 
     @property
     def _heads(self) -> AllHeads:
@@ -155,26 +146,14 @@ class Ticket:
     @property
     def is_ended(self) -> bool:
         """Whether the entrant has signed its end; or answered all of it, before transcripts."""
+        is_answered = all(each.answered for each in self.instances)
         if self._request.content.transcript is None:
-            return all(each.answered for each in self.instances)
-        if not self._end_path.exists():
+            return is_answered
+        if not self.signed_end.path.exists():
             return False
-        with contextlib.suppress(SMEError):
-            data = read_regular(self._end_path, MAX_BYTES)
-            signed = Signed[AllHeads].from_dict(parse_json(data, self._end_path.name))
-            if signed.content == self._heads and has_signed(
-                self._request, signed.signature, signed.content
-            ):
-                return True
-        where = "/".join(self._end_path.parts[-5:])
-        raise TamperedError(where, "is not the entrant's signature of all transcripts")
-
-    @property
-    def end_digest(self) -> str | None:
-        """The digest of the file in which the entrant has signed its end; None without one."""
-        if not self._end_path.exists():
-            return None
-        return sha256_of(read_regular(self._end_path, MAX_BYTES))
+        if not (is_answered and self.signed_end.is_of(self._heads)):
+            raise self.signed_end.tampered("all transcripts")
+        return True
 
     @property
     def status(self) -> TicketStatus:
@@ -212,16 +191,13 @@ def score_ticket(store: SeasonStore, season: Season, ticket: Ticket) -> SealedRe
     runs, stepping = [], []
     versions: dict[str, str] = {}
     draws, rules = store.document.draws, store.document.rules
-    for number, (instance, hidden) in enumerate(zip(ticket.instances, season.hidden, strict=True)):
-        answered = instance.answers
-        run = failed_run(season.protocol, hidden.member.name, None)
-        if answered[0] is not None:
-            [(run, used)] = score_runs(ticket.hidden(number), [answered], rules)
-            versions |= used
+    for number, instance in enumerate(ticket.instances):
+        [(run, used)] = score_runs(ticket.hidden(number), [instance.answers], rules)
+        versions |= used
         runs.append(run)
         stepping.append(instance.stepping())
     result = sealed_result(season, ticket.id, runs, versions, draws, stepping, rules)
-    return result.model_copy(update={"signed": ticket.end_digest})
+    return result.model_copy(update={"signed": ticket.signed_end.digest})
 
 
 def finish_ticket(store: SeasonStore, season: Season, ticket: Ticket) -> None:
