@@ -206,6 +206,9 @@ def test_the_episodes_of_parallel_lanes_give_one_increasing_line():
         assert median == np.median(ended[-window:])
     axes = plots.training_curve({"step": step, "regret": regret}).axes[0]
     assert np.all(np.diff(axes.lines[0].get_xdata()) > 0)
+    # The window holds all episodes that end at one step.
+    x, _, window = smoothed(np.repeat([100, 200, 300], 64), np.arange(192.0))
+    assert (window, x.tolist()) == (64, [100, 200, 300])
 
 
 @pytest.mark.parametrize(
@@ -495,9 +498,3 @@ def test_commands_write_the_figures_for_which_the_report_has_numbers(
 def test_bad_input_is_refused(report, draw, message):
     with pytest.raises(OptionError, match=message):
         draw(report)
-
-
-def test_the_window_holds_all_episodes_that_end_at_one_step():
-    step = np.repeat([100, 200, 300], 64)
-    x, _, window = smoothed(step, np.arange(192.0))
-    assert (window, x.tolist()) == (64, [100, 200, 300])

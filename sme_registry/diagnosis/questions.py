@@ -174,12 +174,8 @@ def templates() -> Environment:
 
 def words(macro: str, *arguments: Any) -> str:
     """What a macro of the sentences says, on one line."""
-    return " ".join(getattr(_sentences(), macro)(*arguments).split())
-
-
-@cache
-def _sentences() -> Any:
-    return templates().get_template("sentences.jinja").module
+    sentences: Any = templates().get_template("sentences.jinja").module
+    return " ".join(getattr(sentences, macro)(*arguments).split())
 
 
 class Decision(NamedTuple):

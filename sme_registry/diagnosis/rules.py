@@ -217,15 +217,12 @@ def _constraint_violation(run: TaskDiagnosis, limits: Violations) -> Decision:
     else:
         reason = "earns_by_violating" if gain >= THRESHOLDS["gain"] else "violates_without_gain"
     evidence = {
-        "cost": inside.cost,
-        "violating_share": inside.violating_share,
+        **inside.model_dump(exclude={"name", "step_reward"}),
         "violating_entries": entries / len(limits.channels),
         "visited_violating_share": visited.violating_share,
         "region": outside.name,
         "outside_violating_share": outside.violating_share,
         "optimal_cost": limits.report.references["optimal"][0].cost,
-        "safe_regret": inside.safe_regret,
-        "price_of_safety": inside.price_of_safety,
         "gain": gain,
         "channel": worst.channel,
         "channel_cost_share": worst.cost / max(cost, _TINY),

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import retention
-from sme_registry.evaluation.evaluate import OnBatch, same_draw
+from sme_registry.evaluation.evaluate import same_draw
 from sme_registry.evaluation.policies import Policy, check_count, stream_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
@@ -302,8 +302,6 @@ def expected_regret(
     episodes: int = EPISODES,
     seed: int = 0,
     action_range: str | None = None,
-    algorithm: str | None = None,
-    progress: OnBatch | None = None,
 ) -> DynamicRegret:
     """The expected dynamic regret of a life in which given policies act and do not learn.
 
@@ -326,7 +324,7 @@ def expected_regret(
     check_count("life", life, stream.visits, "or number for each visit")
     integer_in("episodes", episodes, 1)
     integer_in("seed", seed, 0)
-    policies = _policies(life, stream, action_range, algorithm)
+    policies = _policies(life, stream, action_range)
     segments = list(enumerate(stream.segments))
     steps = np.diff([*(segment.start for _, segment in segments), stream.cycle_steps])
     parts = [
@@ -342,8 +340,6 @@ def expected_regret(
             policy = policy.in_phase(stream.segments[i].phase, P)
         ran = rollouts(policy, tasks[i], start_states(seed, i, share, stream.state_dim))
         means[which, i] = ran.per_step(ran.regret)
-        if progress is not None:
-            progress(len(means), len(acts))
     ends = np.cumsum(steps[[i for _, i in parts]])
     if stream.switch == "episode" and not any(phase.spec.D for phase in stream.phases):
         T = stream.horizon  # a switch waits for a reset, at the end of an episode
@@ -355,7 +351,7 @@ def expected_regret(
 
 
 def _policies(
-    life: Sequence[Any], stream: StreamSpec, action_range: str | None, algorithm: str | None
+    life: Sequence[Any], stream: StreamSpec, action_range: str | None
 ) -> dict[int, Policy]:
     """The policies of a life, by the `id` of its entries."""
     policies: dict[int, Policy] = {}
@@ -365,7 +361,7 @@ def _policies(
             if isinstance(entry, bool | np.bool_) or not 0.0 <= float(entry) <= 1.0:
                 raise OptionError(f"{where}={entry}: must be a policy, or a regret in [0, 1].")
         elif id(entry) not in policies:
-            policies[id(entry)] = stream_policy(entry, stream, where, action_range, algorithm)
+            policies[id(entry)] = stream_policy(entry, stream, where, action_range)
     return policies
 
 

@@ -39,8 +39,6 @@ from sme_registry.statistics import (
     DRAWS,
     Array,
     Estimate,
-    Statistic,
-    aggregate,
     iqm,
     stratified_bootstrap,
 )
@@ -343,13 +341,7 @@ def evaluate_stream(
     return report._with_plasticity(regrets[alone, range(P)]) if alone else report
 
 
-def across_seeds(
-    reports: Sequence[StreamReport],
-    region: str = "WD",
-    *,
-    draws: int = DRAWS,
-    statistic: Statistic = iqm,
-) -> dict[str, Estimate]:
+def across_seeds(reports: Sequence[StreamReport], region: str = "WD") -> dict[str, Estimate]:
     """The IQM over runs of every number of a region, with 95 % intervals.
 
     `reports` are of one agent on one stream or its draws, one for each seed of its training. From
@@ -378,8 +370,7 @@ def across_seeds(
         runs |= _of_logs(logs, "dynamic_regret")
         if all(log.fresh_online_regret for log in logs):
             runs |= _of_logs(logs, "learning_transfer")
-    digest = reports[0].stream_digest
-    return {name: _estimate(values, digest, draws, statistic) for name, values in runs.items()}
+    return {name: _estimate(values, reports[0].stream_digest) for name, values in runs.items()}
 
 
 def _of_logs(logs: Sequence[DynamicRegret], field: str) -> dict[str, Array]:
@@ -407,10 +398,8 @@ def check_same_stream(reports: Sequence[StreamReport]) -> None:
             )
 
 
-def _estimate(runs: Array, seed: str, draws: int, statistic: Statistic) -> Estimate:
-    classes = {"": runs}
-    low, high = stratified_bootstrap(classes, draws, seed, statistic)
-    return Estimate(aggregate(classes, statistic), low, high)
+def _estimate(runs: Array, seed: str) -> Estimate:
+    return Estimate(iqm(runs), *stratified_bootstrap({"": runs}, DRAWS, seed))
 
 
 def _numbers(value: Any) -> Array:

@@ -311,17 +311,16 @@ def _edges(T: int) -> npt.NDArray[np.int64]:
 
 def _over_time(regret: Array, alive: npt.NDArray[np.bool_], T: int) -> dict[str, Any]:
     """Mean and deciles of `[t, n]` regrets over running episodes, by time; None after the last."""
-    rows: dict[str, list[Any]] = {"mean": [], "low": [], "high": [], "running": []}
+    rows: list[list[Any]] = []
     for low, high in itertools.pairwise(_edges(T)):
         values = regret[low:high][alive[low:high]]
-        numbers: list[float] | list[None] = [None] * 3
+        running = alive[low:high].mean() if low < len(alive) else 0.0
+        numbers: list[Any] = [None] * 3
         if len(values):
             numbers = _rounded([values.mean(), *np.quantile(values, [0.1, 0.9])])
-        for name, number in zip(("mean", "low", "high"), numbers, strict=True):
-            rows[name].append(number)
-        running = alive[low:high].mean() if low < len(alive) else 0.0
-        rows["running"].append(round(float(running), 4))
-    return rows
+        rows.append([*numbers, round(float(running), 4)])
+    columns = zip(("mean", "low", "high", "running"), zip(*rows, strict=True), strict=True)
+    return {name: list(column) for name, column in columns}
 
 
 def _training(log: Log | None) -> dict[str, Any] | None:

@@ -195,10 +195,8 @@ def _unary(op: str, build: ProgramBuilder, x: Any) -> _Value:
     return build.unary(op, _data(x))
 
 
-def _leaking(
-    op: str, default: float, build: ProgramBuilder, x: Any, *, alpha: Any = None
-) -> _Value:
-    return build.unary(op, _data(x), alpha=default if alpha is None else float(alpha))
+def _leaking(op: str, build: ProgramBuilder, x: Any, *, alpha: Any) -> _Value:
+    return build.unary(op, _data(x), alpha=float(alpha))
 
 
 def _binary(op: str, build: ProgramBuilder, left: Any, right: Any) -> _Value:
@@ -263,10 +261,10 @@ def _clip(
     min: Any = -1e300,
     max: Any = 1e300,
 ) -> _Value:
-    ends = [
-        float(end) if value is None else _scalar(value) for value, end in ((low, min), (high, max))
-    ]
-    return build.unary("clip", _data(x), low=ends[0], high=ends[1])
+    low, high = (
+        _scalar(end if value is None else value) for value, end in ((low, min), (high, max))
+    )
+    return build.unary("clip", _data(x), low=low, high=high)
 
 
 def _concat(build: ProgramBuilder, *values: Any, axis: int) -> _Value:
@@ -298,8 +296,8 @@ def _transpose(build: ProgramBuilder, x: Any, perm: Sequence[int] = (1, 0)) -> _
 _OPERATORS: dict[str, Callable[..., _Value]] = {
     **{name: partial(_unary, name.lower()) for name in _UNARY},
     **{name: partial(_binary, name.lower()) for name in ("Add", "Sub", "Mul", "Div")},
-    "Elu": partial(_leaking, "elu", 1.0),
-    "LeakyRelu": partial(_leaking, "leaky_relu", 0.01),
+    "Elu": partial(_leaking, "elu", alpha=1.0),
+    "LeakyRelu": partial(_leaking, "leaky_relu", alpha=0.01),
     "Identity": lambda build, x: x,
     "Cast": _cast,
     "Flatten": _flatten,

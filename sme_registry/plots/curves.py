@@ -78,7 +78,7 @@ def training_curve(
     """
     step, regret = _points(episodes, "regret")
     with canvas(ax, _SIZE, path, title=title) as (axes,):
-        draw_training(axes, step, regret, window)
+        _draw_training(axes, step, regret, window)
         axes.axhline(0.0, color=GREY, linewidth=1.1, label="optimal")
         shade_visits(axes, visits)
     return figure_of(axes)
@@ -103,7 +103,7 @@ def cost_curve(
     """
     step, cost = _points(episodes, "cost")
     with canvas(ax, _SIZE, path, title=title) as (axes,):
-        draw_training(axes, step, cost, window)
+        _draw_training(axes, step, cost, window)
         axes.set_ylim(0.0, max(1.1 * float(cost.max()), 0.01))
         axes.set_ylabel("mean cost per step")
     return figure_of(axes)
@@ -147,16 +147,14 @@ def learning_curve(
     return figure_of(axes)
 
 
-def draw_training(
-    axes: Axes, step: Array, regret: Array, window: int | None = None, unit: str = "episode"
-) -> None:
-    """A dot for each of `[N]` episodes or evaluations of a training, and their running median."""
+def _draw_training(axes: Axes, step: Array, regret: Array, window: int | None) -> None:
+    """A dot for each of `[N]` episodes of a training, and their running median."""
     axes.scatter(
-        step, regret, s=8, color=GREY, alpha=0.4, linewidths=0, rasterized=True, label=f"one {unit}"
+        step, regret, s=8, color=GREY, alpha=0.4, linewidths=0, rasterized=True, label="one episode"
     )
     x, y, width = smoothed(step, regret, window)
     drawn = np.unique(np.linspace(0, len(x) - 1, LINE_POINTS).round().astype(int))
-    label = f"median of the last {width} {unit}s"
+    label = f"median of the last {width} episodes"
     axes.plot(x[drawn], y[drawn], color=COLOURS[0], linewidth=2.2, label=label)
     _label_training(axes)
 
@@ -269,7 +267,6 @@ def performance_curve(
     runs: LifeReports,
     path: str | os.PathLike[str] | None = None,
     *,
-    region: str = "WD",
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Figure:
@@ -284,7 +281,7 @@ def performance_curve(
       >>> figure = performance_curve("runs/life", "performance_curve.png")
     """
     reports = read_lives(runs)
-    agents = [report.region(region).agent for report in reports]
+    agents = [report.region().agent for report in reports]
     R = 1.0 - np.array([agent.normalised_regret for agent in agents])  # [n, V, P]
     x = np.arange(R.shape[1], dtype=float)
     if initial := initial_regrets(agents):
@@ -301,7 +298,7 @@ def performance_curve(
         _draw_level(axes, 1.0, "optimal", "-")
         _draw_level(axes, 0.0, "constant ½", _DASHED)
         tick_visits(axes, reports[0].visits, initial=x[0] < 0)
-        axes.set_ylabel(f"performance in {region}  (1 − normalised regret)")
+        axes.set_ylabel("performance in WD  (1 − normalised regret)")
     return figure_of(axes)
 
 
@@ -346,7 +343,6 @@ def plasticity_curve(
     runs: Lives,
     path: str | os.PathLike[str] | None = None,
     *,
-    region: str = "WD",
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Figure:
@@ -369,14 +365,14 @@ def plasticity_curve(
     with canvas(ax, _SIZE, path, title=lives_title(first, title, named=alone)) as (axes,):
         visits = np.arange(len(first[0].visits), dtype=float)
         lines = {
-            counted(name, reports): (visits, np.array([_ratios(one, region) for one in reports]))
+            counted(name, reports): (visits, np.array([*map(_ratios, reports)]))
             for name, reports in methods.items()
         }
         _draw_lines(axes, lines, iqm, "IQM", linewidth=2, markersize=5)
         _draw_level(axes, 1.0, "as a fresh agent", "-")
         tick_visits(axes, first[0].visits)
         axes.set_ylim(bottom=0.0)
-        axes.set_ylabel(f"plasticity ratio in {region}\n(regret / fresh agent's, > 1: lost)")
+        axes.set_ylabel("plasticity ratio in WD\n(regret / fresh agent's, > 1: lost)")
     return figure_of(axes)
 
 
@@ -466,9 +462,9 @@ def _regret(report: StreamReport) -> DynamicRegret:
     return report.dynamic_regret
 
 
-def _ratios(report: StreamReport, region: str) -> Array:
+def _ratios(report: StreamReport) -> Array:
     """`[V]` plasticity ratios; NaN where a fresh agent is optimal."""
-    agent = report.region(region).agent
+    agent = report.region().agent
     if agent.fresh_normalised_regret is None:
         raise OptionError(
             "runs: a report has no fresh agents. Give evaluate_stream their policies, fresh=…."

@@ -18,7 +18,6 @@ from tests.diagnosis.policies import (
     distracted,
     network,
     optimum,
-    printed,
     shrunk,
 )
 
@@ -113,10 +112,9 @@ def test_an_oracle_that_adds_a_function_of_the_distractors_owes_them_its_regret(
     assert "distraction" in [question for question, _, _ in rows]
 
 
-@pytest.mark.parametrize("channel", [0, 1, 2])
-def test_the_share_of_the_error_is_of_the_states_that_the_variance_is_of(channel):
+def test_the_share_of_the_error_is_of_the_states_that_the_variance_is_of():
     def sometimes(observation):  # in one state of ten
-        rare = observation[:, channel : channel + 1] > 0.9
+        rare = observation[:, :1] > 0.9
         return optimum(EXTENDED)(observation) + 0.6 * rare * (observation[:, 8:12] - 0.5)
 
     found = diagnosis_of(sometimes, EXTENDED).measurements.distraction
@@ -216,17 +214,11 @@ def test_plain_tasks_and_mixings_alone_are_asked_nothing_of_limits_and_distracto
         assert not asked & {*ASKED, "distractors_represented"}
 
 
-def test_the_page_the_terminal_and_the_data_have_limits_distractors_and_layers():
+def test_the_page_and_the_data_have_limits_distractors_and_layers():
     diagnosis = diagnosis_of(network(), EXTENDED)
     page = diagnosis.markdown(details=True)
     for heading in ("## Limits", "## Distractors", "## Layers"):
         assert heading in page
-    tables = [line for line in page.splitlines() if line.startswith("|")]
-    assert all(line.endswith("|") for line in tables)
-    shown = " ".join(" ".join(printed(diagnosis, details=True)).split())
-    for verdict in diagnosis.verdicts:
-        assert verdict.sentence() in shown
-        assert verdict.sentence().replace("|", r"\|") in page
     assert Diagnosis.from_dict(diagnosis.to_dict(), "it") == diagnosis
 
 

@@ -235,18 +235,17 @@ def test_dynamic_regret_by_visit_is_that_of_the_task_in_force(life):
 
 
 def played(stream, more):
-    """A life of random actions, by step: `lifetime`, `regret`, `phase`; and its episodes' ends."""
+    """A life of random actions, by step: `lifetime`, `regret` and `phase`."""
     env = sme_registry.make(stream)
     env.action_space.seed(0)
     env.reset(seed=0)
-    rows, ends = [], []
-    for step in range(stream.steps + more):
+    rows = []
+    for _ in range(stream.steps + more):
         *_, terminated, truncated, info = env.step(env.action_space.sample())
         rows.append((info["lifetime"], info["regret"], info["phase"]))
         if terminated or truncated:
-            ends.append(step + 1)
             env.reset()
-    return *map(np.array, zip(*rows, strict=True)), ends
+    return map(np.array, zip(*rows, strict=True))
 
 
 def test_an_episode_in_two_visits_is_divided_in_proportion():
@@ -347,7 +346,7 @@ def test_blocks_of_a_life_give_the_regret_of_its_single_steps(fields):
         {"spec": spec, "steps": steps} for spec, steps in zip(specs, (700, 5, 605), strict=True)
     ]
     stream = StreamSpec(phases=phases, **{"cycles": 2, **fields})
-    lifetime, regret, phase, _ = played(stream, 30)
+    lifetime, regret, phase = played(stream, 30)
     blocks = RegretBlocks(stream, 2)
     for begin in range(0, len(regret), 97):
         part = slice(begin, begin + 97)

@@ -7,7 +7,7 @@ import pytest
 
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation import evaluate_many
+from sme_registry.evaluation import evaluate_many, regions
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.task.engine import engine
@@ -89,11 +89,12 @@ def test_a_pass_ends_once_all_of_its_policies_have_failed():
     assert not calls
 
 
-def test_progress_counts_shared_states_once():
+def test_progress_counts_shared_states_once_batch_by_batch(monkeypatch):
+    monkeypatch.setattr(regions, "BATCH_ROWS", 100)
     calls = []
     specs = [*SIBLINGS, SPEC.derive(seed=1)]
     evaluate_many(
         [(timed, spec) for spec in specs], PROTOCOL, progress=lambda *done: calls.append(done)
     )
-    assert [done for done, _ in calls] == [300 * part for part in range(1, 7)]
+    assert [done for done, _ in calls] == [100 * part for part in range(1, 19)]
     assert {total for _, total in calls} == {1800}

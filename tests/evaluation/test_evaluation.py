@@ -8,7 +8,7 @@ import pytest
 import sme_registry
 from sme_registry import evaluate, materialize
 from sme_registry.errors import SpecError
-from sme_registry.evaluation import references, regions
+from sme_registry.evaluation import references
 from sme_registry.evaluation.evaluate import evaluation_observations
 from sme_registry.spec import EvaluationProtocol, ProtocolFile
 from tests.evaluation.kinds import (
@@ -111,13 +111,6 @@ def test_references_stand_in_their_known_order_and_have_every_region(report):
     for rows in report.references.values():
         assert [(row.epsilon_low, row.epsilon_high) for row in rows] == edges
         assert all(row.clipped_share == 0.0 for row in rows)
-
-
-def test_progress_runs_from_the_first_batch_to_all_states(monkeypatch):
-    monkeypatch.setattr(regions, "BATCH_ROWS", 1_000)
-    seen = []
-    evaluate(half(3), PLAIN, PROTOCOL, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(done, 12_000) for done in range(1_000, 12_001, 1_000)]
 
 
 @pytest.mark.parametrize("protocol", ["quick-v1", "quick", "specs/protocols/quick-v1.json"])

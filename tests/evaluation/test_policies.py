@@ -128,14 +128,9 @@ def test_a_prepared_policy_is_accepted_as_it_is():
         constant(-0.5, 1.0), action_range="symmetric", name="mine"
     )
     assert as_policy(prepared, SPEC, name="other").name == "other"
+    assert as_policy(evaluated, SPEC).name == "evaluated"
     with pytest.raises(PolicyError, match=r"its actions have shape \(2,\): must be \(1,\)"):
         evaluate(prepared, SPEC.derive(action_dim=1), PROTOCOL)
-
-
-def test_a_policy_is_named_after_its_function():
-    assert as_policy(evaluated, SPEC).name == "evaluated"
-    assert as_policy(lambda o: o, SPEC).name == "policy"
-    assert as_policy(evaluated, SPEC, name="mine").name == "mine"
 
 
 def archive(data):
@@ -452,25 +447,16 @@ def test_modules_and_functions_of_pytorch_are_policies():
     assert regrets(actor.double()) == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("last", "message"),
-    [
-        (lambda y: (y, y), r"'Actor': returns an object of type tuple.*\[0\]` for a tuple"),
-    ],
-)
-def test_modules_with_unusable_actions_are_refused(last, message):
+def test_modules_and_functions_of_tensors_are_told_what_is_wrong():
     torch = pytest.importorskip("torch")
 
     class Actor(torch.nn.Module):
         def forward(self, x):
-            return last(x[:, :2])
+            return x, x
 
+    message = r"'Actor': returns an object of type tuple.*\[0\]` for a tuple"
     with pytest.raises(PolicyError, match=message):
         evaluated(Actor())
-
-
-def test_a_function_of_tensors_is_told_that_observations_are_arrays():
-    torch = pytest.importorskip("torch")
     actor = torch_actor(torch)
     with pytest.raises(PolicyError, match=r"NumPy arrays: `torch\.as_tensor\(observations\)`"):
         evaluated(lambda o: actor(o))

@@ -63,19 +63,12 @@ def test_a_safe_action_that_float32_rounds_up_does_not_violate():
     assert 0.0 < score.cost < 1e-6
 
 
-@pytest.mark.parametrize("name", [*SAFE_NAMES, "linear", "constant", "random"])
-def test_reference_policies_by_name_have_the_numbers_of_the_reports_references(report, name):
-    evaluated = evaluate(name, SAFE, PROTOCOL).safety.regions
-    expected = report.safety.references[name]
-    # Fitted and random ones have states and numbers of their own.
-    tolerance = 1e-9 if name in SAFE_NAMES else 0.05
-    for one, other in zip(evaluated, expected, strict=True):
-        assert one.cost == pytest.approx(other.cost, abs=tolerance)
-        assert one.step_reward == pytest.approx(other.step_reward, abs=tolerance)
-
-
 @pytest.mark.parametrize("name", SAFE_NAMES)
-def test_safe_references_need_limits(name):
+def test_safe_references_by_name_have_the_reports_numbers_and_need_limits(report, name):
+    evaluated = evaluate(name, SAFE, PROTOCOL).safety.regions
+    for one, other in zip(evaluated, report.safety.references[name], strict=True):
+        assert one.cost == pytest.approx(other.cost, abs=1e-9)
+        assert one.step_reward == pytest.approx(other.step_reward, abs=1e-9)
     assert name in POLICIES
     with pytest.raises(SpecError, match="needs a task with safety"):
         evaluate(name, SMESpec(), PROTOCOL)
