@@ -4,10 +4,9 @@
 
 In the ticket's folder, `<number>.journal` has the actions, `<number>.json` the head of the
 transcript that the entrant has signed last, `<number>.challenge` the challenge states,
-`<number>.npy` the answers, and `<number>.npz` a snapshot of its `Play`. A snapshot is written when
-the entrant signs, and when the instance leaves memory; so a journal is read only from there on, and
-as a whole only where the snapshot is lost. Each method may be called again after a lost answer,
-without a further effect.
+`<number>.npy` the answers, and `<number>.npz` a snapshot of its `Play`, of when the entrant signed
+or the instance left memory: the journal is read from there on. Each method may be called again
+after a lost answer, without a further effect.
 """
 
 from __future__ import annotations
@@ -105,8 +104,7 @@ class SignedFile(Generic[_Kind]):
 class Instance:
     """One hidden instance, for any number of threads.
 
-    `hidden` derives the task; `check_running` rejects what comes after the ticket's end. `budget`
-    is in steps over all lanes.
+    `hidden` derives the task; `check_running` rejects what comes after the ticket's end.
     """
 
     def __init__(

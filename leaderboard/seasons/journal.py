@@ -1,20 +1,15 @@
 """`Journal` and `Play`: what was played of an instance, on disk and in memory.
 
-`Journal`: the actions that a ticket took on one instance, on disk before their answer leaves.
+The journal has the actions, on disk before their answer leaves.
 
     header   magic, lanes L, action channels A, CRC-32 of these
     record   number of the request 1, 2, …; L · A actions; CRC-32 of these
 
-Integers and float32 are little-endian, and every record has the same size. The environment is
-deterministic, so its state and the budget used follow from the journal: a killed server continues
-where it was. A record with the number 0 and zeros ends the stepping. What a loss of power, or a
-kill in the middle of a write, leaves of the last record is ignored, and cut off by the next one.
-
-`Play`: one hidden instance after so many requests: its lanes, its transcript, and the regret.
-
-All follows from the start and the requests, so a replay of the same actions gives the same numbers,
-bit for bit. A snapshot has what the next steps need, without the regret, which is that of a replay.
-`L` lanes, `S` state_dim, `A` action_dim.
+Integers and float32 are little-endian, and every record has the same size. A record with the number
+0 and zeros ends the stepping. What a loss of power, or a kill in the middle of a write, leaves of
+the last record is ignored, and cut off by the next one. All else follows from the start and the
+journal, bit for bit: a killed server continues where it was. A snapshot has what the next steps
+need, without the regret, which is that of a replay.
 
     normalised online regret = Σ regret / Σ regret of the constant ½ in the same states
 

@@ -4,13 +4,11 @@
     datasets/sealed/<season>/<class>-<instance>-v0/data/…   in Minari's format
     challenges/<class>-<instance>.npy                       float32 `[regions · n, S + 2]`
 
-All of it follows from the terms and the master, and `season.json` has its digests: of each instance
-a data set and challenge states.
+All of it follows from the terms and the master, and `season.json` has its digests.
 
 Opening a board has checked each document against the log, and each master against its commitment.
-What is left to `verify_seasons` are the signatures, the terms, and after the reveal data sets,
-challenge states and scores: of offline entries from their answers, of tickets from what was played,
-which the entrants signed.
+What is left to `verify_seasons` are signatures, and after the reveal data sets, challenge states
+and scores: of offline entries from their answers, of tickets from what was played and signed.
 """
 
 from __future__ import annotations
@@ -241,10 +239,7 @@ def _dataset_id(season: str, hidden: Hidden[SeasonClass]) -> str:
 def verify_seasons(
     store: SeasonStore, findings: Findings, published: Sequence[str | Path] = ()
 ) -> None:
-    """Verify all seasons of a board, whose log was followed.
-
-    `published` are folders as `season new` wrote them, of seasons whose board has no copy.
-    """
+    """Verify all seasons of a board; `published` are folders of those of which it has no copy."""
     folders = {read_season(folder).digest: Path(folder) for folder in published}
     for row in store.seasons():
         _SeasonVerifier(store, row, findings, folders).check()
@@ -329,8 +324,7 @@ class _SeasonVerifier:
     def outcome(self, instance: HiddenTask, master: Master, expected: Digests) -> str:
         """How what was published of an instance follows from the master.
 
-        Where digests differ, as other processors and versions of NumPy may round otherwise, data
-        sets are compared, if they are here.
+        Other processors and versions of NumPy may round otherwise: then data sets are compared.
         """
         data, folder = SealedDataset.collect(recipe(instance, master)), self.published()
         follows = sha256_of(instance.challenge) == expected.challenge

@@ -1,13 +1,8 @@
 """What a season accepts as an entry; from answers to results of entries and tickets, and to ranks.
 
-The answers of an entry are uploads of the entrant's key, which come first, and are checked when the
-entry is. Nothing is scored before the reveal.
-
-    challenge states  the observations that `sme_registry.evaluate` shows to a policy under the
-                      season's protocol, with the seed of the instance's secret
-    score of a run    that of a policy that returns the entrant's answers, in the same order
-
-So scores are those of the open board, and there is no second scorer. What counts:
+Challenge states are the observations that `sme_registry.evaluate` shows to a policy under the
+season's protocol, with the seed of the instance's secret. A run has the score of a policy that
+returns the entrant's answers, so there is no second scorer. What counts:
 
     offline   of each key and method the entry before the close that was signed last counts
     online    every ticket of a key and method counts: its runs are those of all of them
@@ -117,9 +112,9 @@ Answered = tuple[Float32 | None, str | None]
 def score_runs(
     instance: HiddenTask, answered: Sequence[Answered], rules: int = RULES
 ) -> list[tuple[RunScore, dict[str, str]]]:
-    """The scores of several answers on an instance, and the versions of packages behind them.
+    """The scores of several answers on an instance, of which the optimum takes most of the time.
 
-    Its optimum takes most of the time. No answers score 1 in every metric.
+    With the versions of packages behind them. No answers score 1 in every metric.
     """
     name, spec = instance.hidden.member.name, instance.spec
     policies = [

@@ -214,8 +214,7 @@ class SeasonStore(Store):
         """
         with self.transaction():
             row = self.entrant(result.subject)
-            if row is None:
-                raise BoardError(f"entry={result.subject}: is not on this board.")
+            assert row is not None  # what was scored is on the board
             if self.clock.received() < not_before:
                 raise BoardError(
                     f"ticket={row.number}: it is {self.clock.time}, and the ticket ends at "

@@ -3,12 +3,6 @@
 The answer to a request for a ticket has the ticket's password, and a board keeps requests where
 others may read them. So a request is sent with a header `Authorization` as for an upload, whose
 signature is at most ten minutes old, and nobody else can repeat it.
-
-An instance without answers, or whose answers the entrant has not signed, scores 1 in every metric,
-whatever its steps.
-
-Beside requests, every second the journals are synced, and tickets that are over are closed, and put
-into the board's queue of what is scored.
 """
 
 from __future__ import annotations

@@ -129,7 +129,6 @@ class Store:
             if self.read_only:
                 raise
             self._connect(rebuild=True)
-            self._refresh()
 
     def close(self) -> None:
         """Close the index and the lock; closing twice does nothing."""

@@ -6,7 +6,7 @@ import pytest
 
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
-from leaderboard.errors import BoardError, Rejection
+from leaderboard.errors import Rejection
 from leaderboard.scoring.verify import verify
 from leaderboard.seasons import scoring as entries
 from leaderboard.seasons.season import MAX_OFFLINE_INSTANCES, Entry
@@ -24,7 +24,6 @@ from tests.leaderboard.seasons.sealing import (
     tiny_season,
 )
 from tests.leaderboard.serving import authorization, serving
-from tests.leaderboard.store.crashing import fill, small_disk
 
 SEASON = tiny_season()
 GOOD = pack_table(np.full((300, 1), 0.5, np.float32))
@@ -251,19 +250,3 @@ def test_a_full_board_and_a_key_that_has_sent_its_entries_of_a_day_lose_nothing(
         for version in ("1", "2"):
             assert send(store, entry(store, key, None, None, statement=version))
         assert refused(store, entry(store, key, None, None, statement="3")) == "quota"
-
-
-def test_a_full_disk_loses_nothing_and_the_entry_can_be_sent_again(tmp_path, key):
-    with small_disk(tmp_path / "disk", "1000k") as disk:
-        if disk is None:
-            pytest.skip("no file system may be mounted here")
-        with tiny_board(disk / "board") as store:
-            store.announce(SEASON)
-            signed, before = entry(store, key, GOOD, None), store.head
-            fill(disk / "filler", free=0)
-            with pytest.raises(BoardError, match=r"No space left|is full"):
-                send(store, signed, GOOD)
-            assert store.head == before
-            (disk / "filler").unlink()
-            assert send(store, signed, GOOD)
-            verify(disk / "board", board=SeasonStore)

@@ -2,7 +2,6 @@
 
 import hashlib
 import itertools
-import stat
 from typing import get_args
 
 import pytest
@@ -97,17 +96,6 @@ def test_the_seed_of_published_states_has_no_bits_of_another_secret():
     place = Place("autumn", "deep", 0)
     first = {each: int.from_bytes(MASTER.secret(each, place)[:8]) >> 11 for each in PURPOSES}
     assert {each for each in PURPOSES if first[each] == MASTER.states_seed(place)} == {"states"}
-
-
-def test_a_master_is_written_for_its_owner_only_and_never_shown(tmp_path):
-    path = MASTER.write(tmp_path / "new" / "season.master")
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert Master.read(path) == MASTER
-    assert MASTER.raw.hex() not in repr(MASTER)
-    assert repr(MASTER.raw) not in repr(MASTER)
-    with pytest.raises(BoardError, match="already exists"):
-        MASTER.write(path)
-    assert Master.read(path) == MASTER
 
 
 def test_a_file_without_a_master_is_named(tmp_path):

@@ -2,7 +2,6 @@
 
 import pytest
 
-from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.seasons.season import Master, Reveal
@@ -75,21 +74,6 @@ def test_a_season_is_played_from_its_announcement_to_its_results_and_reindexed(s
         store.folder.path, board=SeasonStore
     ).missing  # an answer that the board lost
     assert missing.startswith("sha256:aa")
-
-
-def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
-    season = tiny_season(ONLINE)
-    store.announce(season)
-    first = signed_request(store, season, key, 1)
-    assert [store.add(first) for _ in range(2)] == [(1, True), (1, False)]
-    assert store.add(signed_request(store, season, key, 2)) == (2, True)
-    other = SigningKey.generate()
-    assert store.add(signed_request(store, season, other, 3)) == (3, True)
-    result = failed_result(season, first.id)
-    assert store.finish(result)
-    assert not store.finish(result)
-    with pytest.raises(BoardError, match="is not on this board"):
-        store.finish(failed_result(season, "sha256:" + "0" * 64))
 
 
 @pytest.mark.parametrize("track", [OFFLINE, ONLINE])
@@ -185,22 +169,6 @@ def test_an_id_is_one_seasons_and_a_season_ahead(store):
         store.announce(tiny_season(title="Another"))
     with pytest.raises(BoardError, match="must be after the board's time"):
         store.announce(tiny_season(id="past", opens=moment(-3), closes=moment(-2)))
-
-
-def test_an_altered_document_of_a_season_is_named(store, key, later):
-    play(store, key, later)
-    events = {"season", "revealed", "entry", "ticket", "ended", "ranked"}
-    entries = {entry.event: entry for entry in store.log() if entry.event in events}
-    assert entries.keys() == events
-    for entry in entries.values():
-        path = store.folder.object(entry.document)
-        text = path.read_text()
-        path.write_text(text.replace(": ", ":  ", 1))
-        with pytest.raises(TamperedError) as error:
-            SeasonStore.open(store.folder.path, read_only=True)
-        assert error.value.where == path.relative_to(store.folder.path).as_posix()
-        path.write_text(text)
-    SeasonStore.open(store.folder.path, read_only=True).close()
 
 
 def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path, key, later):

@@ -44,11 +44,10 @@ def fails(number):
     return call
 
 
-def refused(code, *arguments, **others):
+def refused(code, call, *arguments, **named):
     """The message of a refusal with this code."""
-    call, *rest = arguments
     with pytest.raises(Rejection) as caught:
-        call(*rest, **others)
+        call(*arguments, **named)
     assert caught.value.code == code
     return caught.value.message
 

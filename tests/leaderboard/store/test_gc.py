@@ -6,7 +6,7 @@ import pytest
 from leaderboard import admission
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.store import Store
-from leaderboard.store.log import Objects, collect_garbage
+from leaderboard.store.log import collect_garbage
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_submission
 
@@ -89,21 +89,3 @@ def test_gc_between_check_and_log_entry_refuses_the_submission(store, key, monke
         assert store.put_object(digest, data, by=key.public)
     assert admission.admit(store, signed)
     assert collect_garbage(store, objects_older_than=0).objects == 0
-
-
-def test_an_old_artefact_that_gc_removes_may_be_uploaded_again(store, key, monkeypatch):
-    data = b"old, and uploaded again"
-    digest = put(store, key, data)
-    age(store.folder.object(digest), DAY + 60)
-    real, collected = Objects.put, []
-
-    def collect_then_put(*arguments):
-        with Store.open(store.folder.path) as other:
-            collected.append(collect_garbage(other).objects)
-        return real(*arguments)
-
-    monkeypatch.setattr(Objects, "put", collect_then_put)
-    assert put(store, key, data) == digest
-    assert collected == [1]
-    assert store.objects.read(digest) == data
-    assert collect_garbage(store).objects == 0

@@ -1,10 +1,8 @@
 """Objects, the lock of a board, and boards without `flock`: read, but not written."""
 
 import json
-import os
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -42,24 +40,6 @@ def test_altered_missing_and_misnamed_objects_are_not_returned(store):
     for name in ("../../board.key", "sha256:../board.key", "sha256:" + "A" * 64):
         with pytest.raises(ValueError, match="not a digest"):
             store.objects.has(name)
-
-
-def test_many_threads_upload_the_same_object_once(store):
-    data = os.urandom(50_000)
-    new = []
-
-    def upload():
-        new.append(store.put_object(sha256_of(data), data, by=KEY))
-
-    threads = [threading.Thread(target=upload) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(new) == 8
-    assert any(new)
-    assert stored(store) == [store.folder.object(sha256_of(data)).name]
-    assert store.total_bytes() == len(data)
 
 
 WITHOUT_POSIX = """

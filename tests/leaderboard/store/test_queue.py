@@ -231,16 +231,3 @@ def test_a_claim_made_before_reindexing_is_no_longer_current(store, submit):
     again = store.queue.claim("another")
     assert not store.queue.finish(claim, synthetic_result(store, claim.id))
     assert store.queue.finish(again, synthetic_result(store, again.id))
-
-
-def test_a_result_of_another_submission_or_protocol_is_refused(store, submit):
-    one, other = submit(0), submit(1)
-    claim = store.queue.claim("worker")
-    assert claim.id == one.id
-    with pytest.raises(ValueError, match="result of"):
-        store.queue.finish(claim, synthetic_result(store, other.id))
-    foreign = synthetic_result(store, one.id, code="onnx_op").model_copy(
-        update={"protocol": "sha256:" + "0" * 64}
-    )
-    with pytest.raises(ValueError, match="result of"):
-        store.queue.finish(claim, foreign)
