@@ -48,8 +48,6 @@ def new_board_folder(board: str | Path) -> Path:
 NewBoardFolder = Annotated[
     Path, typer.Argument(metavar="BOARD", help="The board's new folder.", parser=new_board_folder)
 ]
-complete_protocol = catalogue.completion(ProtocolFile)
-
 
 app = typer.Typer()
 admin = typer.Typer(no_args_is_help=True)
@@ -76,7 +74,7 @@ def init(
         typer.Option(
             help="A protocol's name (see `sme list`) or file; default paper-v1, for practice "
             "quick-v1.",
-            autocompletion=complete_protocol,
+            autocompletion=catalogue.completion(ProtocolFile),
         ),
     ] = None,
     title: Annotated[
@@ -107,7 +105,6 @@ def init(
 
       sme-leaderboard init board --practice
     """
-
     file = find_suite(suite)
     protocol = protocol or ("quick-v1" if practice else "paper-v1")
     if runs_to_rank is None:
@@ -129,13 +126,12 @@ def init(
         document = store.document
     folder = escape(str(board))
     classes, instances = len(file.suite.classes), len(file.suite.instances)
-    runs = document.runs_needed
+    needed = plural(document.runs_needed, "trained policy", "trained policies")
     kind = "a practice board" if document.practice else "a board"
     out().print(f"Created {folder}: {kind} with suite {name} and protocol {protocol_name}.")
     print_line(
-        f"A ranked entry needs {plural(runs, 'trained policy', 'trained policies')}: at "
-        f"least {runs_to_rank} in each class ({classes}), equally many on each of its instances "
-        f"({instances} in the suite)."
+        f"A ranked entry needs {needed}: at least {runs_to_rank} in each class ({classes}), "
+        f"equally many on each of its instances ({instances} in the suite)."
     )
     print_line(
         "Next, serve the board, which also scores its reference rows: "
@@ -164,7 +160,6 @@ def score(
 
       sme-leaderboard score board --workers 2
     """
-
     isolation: Isolation = "process" if unsafe_no_sandbox else available_isolation()
     if isolation == "process" and not unsafe_no_sandbox:
         print_note(
@@ -342,8 +337,7 @@ def key(key: KeyFile = DEFAULT_KEY) -> None:
 
       sme-leaderboard admin key --key lab.key
     """
-    public = own_key(key).public
-    print_line(f"{escape(str(key))}\npublic key {public}")
+    print_line(f"{escape(str(key))}\npublic key {own_key(key).public}")
 
 
 @admin.command()
@@ -354,7 +348,6 @@ def reindex(board: BoardFolder = Path("board")) -> None:
 
       sme-leaderboard admin reindex board
     """
-
     with Board.open(board, reindex=True) as store:
         out().print(f"Indexed {len(store.entries()):,} entries.")
 
@@ -380,7 +373,6 @@ def clock(
 
       sme-leaderboard admin clock board --correct
     """
-
     with Board.open(board) as store:
         store.note_clock(anew=True)
         if correct:
@@ -405,7 +397,6 @@ def gc(
 
       sme-leaderboard admin gc board --dry-run
     """
-
     with Board.open(board) as store:
         garbage = collect_garbage(
             store, objects_older_than=older_than_hours * 3600.0, dry_run=dry_run
@@ -441,12 +432,16 @@ def demo(
 
       sme-leaderboard demo runs/demo
     """
-
     record = RunRecord.read(run)
     if record is None or record.status != "finished":
         raise OptionError(f"run={str(run)!r}: holds no finished run. Create one with `sme demo`.")
     folder = run / "leaderboard" if out_folder is None else out_folder
-    _refuse_other_files(folder)
+    existing = [folder / name for name in sorted(_FOLDERS) if os.path.lexists(folder / name)]
+    if existing and not _is_demonstration(folder / "board"):
+        raise OptionError(
+            f"out={str(folder)!r}: {', '.join(map(str, existing))}: already exists and is not "
+            "from a demonstration. Nothing was removed: use another --out, or move the files."
+        )
     for name in _FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)  # the next write reports what remains
 
@@ -490,24 +485,14 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
         admission.submit_bundle(store, folder / "bundle")
 
 
-def _refuse_other_files(folder: Path) -> None:
-    existing = [folder / name for name in sorted(_FOLDERS) if os.path.lexists(folder / name)]
-    if existing and not _is_demonstration(folder / "board"):
-        raise OptionError(
-            f"out={str(folder)!r}: {', '.join(map(str, existing))}: already exists and is not "
-            "from a demonstration. Nothing was removed: use another --out, or move the files."
-        )
-
-
 def _is_demonstration(path: Path) -> bool:
     """Whether a demonstration created this board; a link may lead to a board worth keeping."""
     try:
         document = Folder(path).read()
     except BoardError:
         return False
-    expected = (_TITLE, f"{_SUITE}-v1", [_SUITE])
-    classes = [member.name for member in document.suite.classes]
-    return not path.is_symlink() and (document.title, document.suite_name, classes) == expected
+    named = document.title, document.suite_name
+    return not path.is_symlink() and named == (_TITLE, f"{_SUITE}-v1")
 
 
 def _name_of(protocol: EvaluationProtocol) -> str:

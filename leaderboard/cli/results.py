@@ -29,7 +29,7 @@ from leaderboard.web.client import MOST_BYTES, PublicView, public_view
 from leaderboard.web.client import fetch as fetch_board
 from leaderboard.web.tables import RankingFile, steps_text
 from sme_registry.errors import OptionError
-from sme_registry.io.markup import Table
+from sme_registry.io.markup import Table, plural
 from sme_registry.io.terminal import (
     Progress,
     err,
@@ -80,7 +80,6 @@ def board_folder(board: str | Path) -> Path:
 
 def open_board(board: Path) -> Store:
     """Open a board read-only; a bar shows the progress if its log is long."""
-
     log = Folder(board).log
     entries = sum(1 for _ in os.scandir(log)) if log.is_dir() else 0
     with Progress(
@@ -143,7 +142,6 @@ def rank(
 
       sme-leaderboard rank board --csv > ranking.csv
     """
-
     if json + csv + latex > 1:
         raise OptionError("--json, --csv, --latex: give at most one of them.")
     with open_board(Path(board)) as store:
@@ -157,11 +155,8 @@ def rank(
     elif csv or latex:
         sys.stdout.write(file.to_csv() if csv else file.to_latex())
     else:
-        notes = []
-        if document.practice:
-            needed = document.runs_to_rank
-            runs = "one run" if needed == 1 else f"{needed} runs"
-            notes.append(f"A practice board: a rank needs {runs} in each class.")
+        needed = plural(document.runs_to_rank, "run")
+        notes = [f"A practice board: a rank needs {needed} in each class."] * document.practice
         out().print(ranking_table(rows, metric, f"on {document.suite_name}", notes))
 
 
@@ -264,7 +259,6 @@ def show(
 
 def _public_view(board: str, id: str) -> PublicView:
     """What a board's folder or a served board publishes about a submission."""
-
     if is_url(board):
         return PublicView.from_dict(client.status(board, id))
     with open_board(Path(board)) as store:

@@ -354,7 +354,6 @@ def withdraw(
 
       sme-leaderboard withdraw https://board.example sha256:… --reason "a bug in the wrapper"
     """
-
     signing_key = SigningKey.read(key)
     if is_url(board):
         client.withdraw(board, id, signing_key, reason)

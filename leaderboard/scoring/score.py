@@ -37,12 +37,11 @@ ten layers): PPO, TD3 and SAC of 2,048 to 102,400 steps 0.090, a network after 1
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import secrets
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -211,25 +210,16 @@ def _evaluate(
         policy = _CheckedPolicy(sandbox, states, agents)
         seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
         protocol = board.protocol.model_copy(update={"seed": seed})
-        with _sandbox_errors():
+        try:
             report = evaluate(
                 policy, spec, protocol, action_range="unit", name=digest, progress=progress
             )
             actions = observe(sandbox)
+        except PolicyError as error:  # as policies wrap the errors of any callable
+            raise error.__cause__ if isinstance(error.__cause__, SMEError) else error from None
     used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
     machine.versions |= {**used, "onnxruntime": sandbox.runtime}
     return report, actions
-
-
-@contextlib.contextmanager
-def _sandbox_errors() -> Iterator[None]:
-    """Raise the sandbox's errors, which policies wrap like those of any callable, as they are."""
-    try:
-        yield
-    except PolicyError as error:
-        if isinstance(error.__cause__, SMEError):
-            raise error.__cause__ from None
-        raise
 
 
 class _CheckedPolicy:

@@ -28,7 +28,7 @@ from typing import Any, Literal
 
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.result import Result, RunScore
-from leaderboard.documents.submission import Run, Submission
+from leaderboard.documents.submission import Run
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.scoring.ranking import failed_run, levels_of, never_listed, result_of, run_metrics
 from leaderboard.scoring.score import agent_names, evaluation_seed, score_submission
@@ -369,20 +369,20 @@ class _Verifier:
     def score_again(self, drawn: Sequence[str], scored: int) -> None:
         """Score submissions again, through gate, sandbox and evaluation, and compare."""
         submissions = {id: self.store.submission(id).content for id in drawn}
-        whole = {id: each for id, each in submissions.items() if self._has_policies(each)}
-        document, read = self.store.document, self.store.objects.read
+        document, objects = self.store.document, self.store.objects
+        whole = {
+            id: each
+            for id, each in submissions.items()
+            if all(objects.has(run.artefact.sha256) for run in each.runs if run.artefact)
+        }
         self.findings.compare(
             (
-                (id, self.store.result(id), score_submission(document, submission, read))
+                (id, self.store.result(id), score_submission(document, submission, objects.read))
                 for id, submission in whole.items()
             ),
             (scored - len(drawn), "not drawn: --rescore"),
             (len(drawn) - len(whole), "their policy files are not here"),
         )
-
-    def _has_policies(self, submission: Submission) -> bool:
-        files = [run.artefact.sha256 for run in submission.runs if run.artefact is not None]
-        return all(map(self.store.objects.has, files))
 
     def _contradiction(self, result: Result) -> Difference | None:
         """The first value of a result that does not follow from the regrets of its runs."""

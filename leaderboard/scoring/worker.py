@@ -67,7 +67,6 @@ def run_scorer(
     *,
     worker: str | None = None,
     until_empty: bool = True,
-    progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
     retry: bool = True,
     isolation: Isolation | None = None,
@@ -98,7 +97,7 @@ def run_scorer(
                 if claim.is_job and work.job is not None:
                     _do(store, claim, work.job)
                 else:
-                    result = _score(store, claim, progress, isolation)
+                    result = _score(store, claim, isolation)
                     written += result is not None and _finish(store, claim, result, patience, stop)
     return written
 
@@ -116,15 +115,12 @@ def _do(store: Store, claim: Claim, job: Job) -> None:
         store.queue.release(claim, type(error).__name__)
 
 
-def _score(
-    store: Store, claim: Claim, progress: Progress | None, isolation: Isolation | None
-) -> Result | None:
+def _score(store: Store, claim: Claim, isolation: Isolation | None) -> Result | None:
     """Score a claimed submission; None after a fault, which postpones it."""
     try:
         submission = store.submission(claim.id).content
-        return score_submission(
-            store.document, submission, store.objects.read, progress, isolation=isolation
-        )
+        read = store.objects.read
+        return score_submission(store.document, submission, read, isolation=isolation)
     except (MissingDependencyError, KeyboardInterrupt):
         store.queue.release(claim)
         raise
