@@ -58,19 +58,31 @@ _FIELDS = {
 }
 _TEXTS = ("doc_string", "key", "value")  # of any length, since nobody reads them
 
-_SUBGRAPH = "onnx_subgraph", "Export the network alone, its functions inlined"
-_NOT_PLAIN = "onnx_tensor", "Export the network as plain operators with dense tensors in the file"
-_NO_TENSOR = "onnx_interface", "Export the network with plain tensors"
-_UNKNOWN = "onnx_malformed", "Export the network to standard operators only"
-_REASONS = {
-    **dict.fromkeys(("functions", "training_info", "overload", "g", "graphs"), _SUBGRAPH),
-    "ref_attr_name": _SUBGRAPH,
-    **dict.fromkeys(("sparse_initializer", "sparse_tensor", "sparse_tensors"), _NOT_PLAIN),
-    **dict.fromkeys(("tensors", "tp", "type_protos", "segment", "string_data"), _NOT_PLAIN),
-    **dict.fromkeys(("uint64_data", "quantization_annotation"), _NOT_PLAIN),
-    **dict.fromkeys(("sequence_type", "map_type", "optional_type", "opaque_type"), _NO_TENSOR),
-    "sparse_tensor_type": _NO_TENSOR,
-    "external_data": ("onnx_external_data", "Export with external_data=False"),
+_CODES = {  # of fields that are not listed; of all others, "onnx_malformed"
+    field: code
+    for code, fields in {
+        "onnx_subgraph": "functions training_info overload g graphs ref_attr_name",
+        "onnx_tensor": """
+            sparse_initializer sparse_tensor sparse_tensors tensors tp type_protos segment
+            string_data uint64_data quantization_annotation
+        """,
+        "onnx_interface": "sequence_type map_type optional_type opaque_type sparse_tensor_type",
+        "onnx_external_data": "external_data",
+    }.items()
+    for field in fields.split()
+}
+_REMEDIES = {
+    "onnx_malformed": "Export it again, or load and save it with the package onnx",
+    "onnx_version": "Export it with opset_version=17 and the matching IR version",
+    "onnx_domain": "Export the network to standard operators only",
+    "onnx_op": "Export the deterministic actor alone with `sme_registry.export_onnx`, which "
+    "removes what it can and says how to rewrite the rest",
+    "onnx_subgraph": "Export the network alone, its functions inlined",
+    "onnx_external_data": "Export with external_data=False",
+    "onnx_tensor": "Export the network, or a smaller one, in float32 with dense tensors",
+    "onnx_too_many_nodes": "Submit a smaller network, with short names",
+    "onnx_interface": "Export the actor with one input and output, its batch a dynamic axis, for "
+    "this task",
 }
 
 # The name, bytes of an entry, and field of data that is not raw, of each type of tensors.
@@ -178,8 +190,9 @@ def _check_fields(model: Any) -> None:
         kind = message.DESCRIPTOR.name
         for field, value in message.ListFields():
             if field.name not in _FIELDS[kind]:
-                code, remedy = _REASONS.get(field.name, _UNKNOWN)
-                _refuse(code, f"{kind}.{field.name}", "not allowed", remedy)
+                _refuse(
+                    _CODES.get(field.name, "onnx_malformed"), f"{kind}.{field.name}", "not allowed"
+                )
             if field.message_type is None and field.type != field.TYPE_STRING:
                 continue  # numbers, over which nothing iterates
             values = value if hasattr(value, "append") else [value]
@@ -191,7 +204,7 @@ def _check_fields(model: Any) -> None:
                 if any(isinstance(text, bytes) for text in values):
                     _refuse_bytes(f"{kind}.{field.name} that is not UTF-8")
                 longest = max(len(text.encode()) for text in values)
-                _limit(f"bytes of a name in {kind}", longest, MAX_NAME, "Shorten it")
+                _limit(f"bytes of a name in {kind}", longest, MAX_NAME)
         if kind == "TensorProto":
             _check_tensor(message)
 
@@ -202,7 +215,6 @@ def _check_versions(model: Any) -> None:
             "onnx_version",
             f"ir_version={model.ir_version}",
             f"must be in [{IR_VERSIONS[0]}, {IR_VERSIONS[-1]}]",
-            "Export it with an opset from 13 to 23 and the matching IR version",
         )
     domains = [opset.domain for opset in model.opset_import]
     if len(domains) != 1 or domains[0] not in _ONNX_DOMAINS:
@@ -210,16 +222,10 @@ def _check_versions(model: Any) -> None:
             "onnx_domain",
             f"opset_import={[domain[:64] for domain in domains[:4]]}",
             "must be ONNX's own domain, '', once",
-            "Export the network to standard operators only",
         )
     version = model.opset_import[0].version
     if version not in OPSETS:
-        _refuse(
-            "onnx_version",
-            f"opset={version}",
-            f"must be in [{OPSETS[0]}, {OPSETS[-1]}]",
-            "Export it with opset_version=17",
-        )
+        _refuse("onnx_version", f"opset={version}", f"must be in [{OPSETS[0]}, {OPSETS[-1]}]")
 
 
 def _check_node(node: Any, operators: Collection[str], opset: int) -> None:
@@ -229,15 +235,12 @@ def _check_node(node: Any, operators: Collection[str], opset: int) -> None:
             "onnx_domain",
             f"domain={node.domain[:64]!r} of operator {operator!r}",
             "must be ONNX's own, ''",
-            "Export the network to standard operators only",
         )
     if node.op_type not in operators:
         _refuse(
             "onnx_op",
             f"op_type={operator!r}",
             'must be an operator of a feed-forward network (see the tutorial "Your own agent")',
-            "Export the deterministic actor alone with `sme_registry.export_onnx`, which "
-            "removes what it can and says how to rewrite the rest",
         )
     attributes = {attribute.name: attribute.i for attribute in node.attribute}
     if len(attributes) < len(node.attribute):
@@ -266,7 +269,6 @@ def _check_tensor(tensor: Any) -> None:
             "onnx_external_data",
             f"data_location={tensor.data_location} of {name}",
             "must be inside the file",
-            "Export with external_data=False",
         )
     if tensor.data_type not in _TYPES:
         _refuse_type("data_type", tensor.data_type, name)
@@ -282,7 +284,6 @@ def _check_tensor(tensor: Any) -> None:
             "onnx_tensor",
             f"dims={dims} of {name}",
             f"must be at most {MAX_RANK} non-negative lengths of at most {MAX_ENTRIES:,} entries",
-            "Submit a smaller network",
         )
     held = [each for each in _DATA if len(getattr(tensor, each))]
     if len(held) > 1 or not set(held) <= {"raw_data", field}:
@@ -290,7 +291,6 @@ def _check_tensor(tensor: Any) -> None:
             "onnx_tensor",
             f"{', '.join(held)} of {name}",
             f"must be either raw_data or {field} for {type_name}",
-            "Export it again",
         )
     stored = sum(len(getattr(tensor, each)) for each in held)
     expected = prod(dims) * (size if held == ["raw_data"] else 1)
@@ -299,16 +299,14 @@ def _check_tensor(tensor: Any) -> None:
             "onnx_tensor",
             f"dims={dims} of {name}",
             f"must match its {held[0] if held else 'data'} of length {expected:,}, not {stored:,}",
-            "Export it again",
         )
 
 
 def _check_interface(what: str, values: Any, widths: tuple[int | None, ...]) -> None:
     """Require one float32 value `[batch, width]`; None among the widths is an open one."""
-    remedy = f"Export the actor with one {what}, its batch a dynamic axis, for this task"
     allowed = f"must be one float32 {what} [batch, {widths[0]}]"
     if len(values) != 1:
-        _refuse("onnx_interface", f"{what}s={len(values)}", allowed, remedy)
+        _refuse("onnx_interface", f"{what}s={len(values)}", allowed)
     tensor = values[0].type.tensor_type
     # Some exporters write -1 for "any".
     lengths = [
@@ -320,28 +318,23 @@ def _check_interface(what: str, values: Any, widths: tuple[int | None, ...]) -> 
         type_name = _TYPES.get(tensor.elem_type, (f"type {tensor.elem_type}",))[0]
         shape = ", ".join("any" if length is None else str(length) for length in lengths)
         name = values[0].name[:64]
-        _refuse("onnx_interface", f"{what} {name!r}={type_name} [{shape}]", allowed, remedy)
+        _refuse("onnx_interface", f"{what} {name!r}={type_name} [{shape}]", allowed)
 
 
-def _limit(what: str, count: int, limit: int, remedy: str = "Submit a smaller network") -> None:
+def _limit(what: str, count: int, limit: int) -> None:
     if count > limit:
-        _refuse("onnx_too_many_nodes", f"{what}={count:,}", f"must be at most {limit:,}", remedy)
+        _refuse("onnx_too_many_nodes", f"{what}={count:,}", f"must be at most {limit:,}")
 
 
-def _refuse(code: str, field: str, allowed: str, remedy: str) -> NoReturn:
-    raise Refused(code, f"{field}: {allowed}. {remedy}.")
+def _refuse(code: str, field: str, allowed: str) -> NoReturn:
+    raise Refused(code, f"{field}: {allowed}. {_REMEDIES[code]}.")
 
 
 def _refuse_bytes(what: str) -> NoReturn:
-    _refuse(
-        "onnx_malformed",
-        f"policy: {what}",
-        "must be one complete ONNX model, as `onnx.save` writes it",
-        "Export it again, or load and save it with the package onnx",
-    )
+    allowed = "must be one complete ONNX model, as `onnx.save` writes it"
+    _refuse("onnx_malformed", f"policy: {what}", allowed)
 
 
 def _refuse_type(field: str, value: int | None, where: str) -> NoReturn:
     names = ", ".join(name for name, *_ in _TYPES.values())
-    remedy = "Export the network in float32"
-    _refuse("onnx_tensor", f"{field}={value} of {where}", f"must be one of {names}", remedy)
+    _refuse("onnx_tensor", f"{field}={value} of {where}", f"must be one of {names}")
