@@ -144,15 +144,15 @@ class BoardDocument(Document):
     def suite_file(self) -> SuiteFile:
         """The suite as a file, from which others train on it."""
         name, _, version = self.suite_name.rpartition("-v")
-        named = {"name": name, "version": int(version)} if name and version.isdecimal() else {}
-        return SuiteFile.from_dict(
-            {
-                **(named or {"name": self.suite_name}),
-                "description": self.suite_description,
-                "tags": self.suite_tags,
-                "digest": self.suite.digest,
-                "suite": self.suite.to_dict(),
-            }
+        if not (name and version.isdecimal()):
+            name, version = self.suite_name, "1"
+        return SuiteFile(
+            name=name,
+            version=int(version),
+            description=self.suite_description,
+            tags=self.suite_tags,
+            digest=self.suite.digest,
+            suite=self.suite,
         )
 
     @property

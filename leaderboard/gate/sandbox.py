@@ -43,7 +43,7 @@ from sme_registry import SMESpec
 from sme_registry.errors import StateError
 from sme_registry.evaluation import interface_of
 from sme_registry.export import FEED_FORWARD
-from sme_registry.io import require_packages
+from sme_registry.io import require_packages, visible
 
 Observations = npt.NDArray[np.float32]
 Actions = npt.NDArray[np.float32]
@@ -126,7 +126,7 @@ class Confined:
             started = self._ask(limits.start_seconds, size=child.START.size)
             self._starting = False
             self._memory, version = child.START.unpack(started)
-            self.runtime = printable(version.rstrip(b"\0"))
+            self.runtime = visible(version.rstrip(b"\0").decode("utf-8", "replace"))
             if self._memory < min(self._limits.memory_bytes, LEAST_MEMORY):
                 self._raise_if_memory_was_short("The sandbox reads no file")
 
@@ -178,7 +178,8 @@ class Confined:
             raise Rejection(
                 "run_failed", f"answer={status}, {length} bytes: invalid. Submit another model."
             )
-        text = printable(b" ".join(self._receive(length, deadline).split()))
+        answer = self._receive(length, deadline).decode("utf-8", "replace")
+        text = visible(" ".join(answer.split()))
         if status == child.REJECTED:
             self._reject(*text.partition(" ")[::2])
         if status == child.MEMORY:
@@ -296,9 +297,6 @@ class Sandbox(Confined):
         check_size(data)
         super().__init__(limits, isolation=isolation)
         self._widths = observation_dim, action_dim
-        self._load(data)
-
-    def _load(self, data: bytes) -> None:
         self._send_file(child.LOAD, data, *self._widths)
 
     def __call__(self, observations: Observations) -> Actions:
@@ -420,9 +418,3 @@ def check_size(data: bytes) -> None:
             f"policy={len(data):,} bytes: must be at most {MAX_ARTEFACT_BYTES:,}. "
             "Submit a smaller network.",
         )
-
-
-def printable(text: bytes | bytearray) -> str:
-    """Untrusted text as messages show it, without control characters."""
-    letters = text.decode("utf-8", "replace")
-    return "".join(letter if letter.isprintable() else "�" for letter in letters)
