@@ -84,6 +84,8 @@ THRESHOLDS = {
     "weight_ratio": 2.0,  # of the weight norm to what it is compared with, at least
 }
 
+TINY = 1e-9  # in place of 0 where a share is of it
+
 COMMON_REASONS: dict[str, Answer] = {
     "solved": "no",  # of every "why"
     "learnt_little": "cannot tell",  # of every cause

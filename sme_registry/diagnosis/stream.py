@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from sme_registry.diagnosis import measure
 from sme_registry.diagnosis.behaviour import NetworkState, network_state
 from sme_registry.diagnosis.critics import ranking_in_cube
 from sme_registry.diagnosis.document import Diagnosis, Part, cells, table
-from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Questions, add_to
+from sme_registry.diagnosis.questions import THRESHOLDS, TINY, Decision, Questions, add_to
 from sme_registry.diagnosis.subject import StreamSubject
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.models import load_sb3
@@ -29,6 +29,7 @@ from sme_registry.spec.document import Digest, Integer, Real, StrictModel, Tuple
 from sme_registry.task.loading import load_task
 from sme_registry.task.task import Observation
 
+_T = TypeVar("_T")
 PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
 
 
@@ -123,7 +124,6 @@ _LEGEND = (
     "Dormant units, effective rank and weights go together with lost plasticity in the literature; "
     "none of them proves it. A study gives intervals over seeds.",
 )
-_TINY = 1e-12
 
 STREAM_QUESTIONS: Questions = {}
 """Questions about a life, in order."""
@@ -151,7 +151,7 @@ def _costly_visits(life: StreamDiagnosis) -> Decision:
     fresh = life.fresh("online_regret")
     if not fresh and len(known) == 1:
         return Decision("one_visit", {})
-    total = max(sum(visit.dynamic_regret or 0.0 for visit in known), _TINY)
+    total = max(sum(visit.dynamic_regret or 0.0 for visit in known), TINY)
     rows: list[dict[str, Any]] = [
         {
             **visit.model_dump(include={"visit", "phase", "online_regret"}),
@@ -243,7 +243,7 @@ def _forgetting(life: StreamDiagnosis) -> Decision:
     # The part of the error at the end of the life that was not there after each best visit.
     final = sum(phase.final_normalised_regret for phase in life.phases)
     lost = sum(phase.lost for phase in forgotten)
-    return Decision(bool(forgotten), evidence, lost / max(final, _TINY))
+    return Decision(bool(forgotten), evidence, lost / max(final, TINY))
 
 
 @_why(
@@ -273,7 +273,7 @@ def _loss_of_plasticity(life: StreamDiagnosis) -> Decision:
         return Decision("nothing_learnt", evidence)
     worse = late - early >= THRESHOLDS["difference"]
     reason = "later_visits_worse" if worse else "later_visits_as_good"
-    return Decision(reason, evidence, 1.0 - early / max(late, _TINY))
+    return Decision(reason, evidence, 1.0 - early / max(late, TINY))
 
 
 def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> Decision:
@@ -292,7 +292,7 @@ def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> 
     if life - alone >= THRESHOLDS["difference"]:
         agents = len({visit.phase for visit in visits[1:]})
         reason = "below_fresh_agents" if agents > 1 else "below_one_fresh_agent"
-    return Decision(reason, evidence, 1.0 - alone / max(life, _TINY))
+    return Decision(reason, evidence, 1.0 - alone / max(life, TINY))
 
 
 _network = partial(_why, unclear="network_unknown one_visit")
@@ -401,51 +401,47 @@ def _ranking(
     return ranking_in_cube(load_sb3(model), task, states, seed)
 
 
+def _at(values: Sequence[_T] | None, index: int) -> _T | None:
+    """One of the values; None where they are not known."""
+    return values[index] if values else None
+
+
 def _visits(
     subject: StreamSubject, observation: Observation, ranked: int, seed: int
 ) -> Iterator[VisitDiagnosis]:
     life, regret = subject.report, subject.report.dynamic_regret
     regret_on = life.region("WD").agent.normalised_regret
     logged = {} if regret is None else {visit.visit: visit for visit in regret.visits}
-    unknown = (None,) * len(life.visits)
-    kept = subject.networks or unknown, subject.models or unknown
-    begin = 0
-    for visit, network, model in zip(life.visits, *kept, strict=True):
-        log = logged.get(visit.visit)
+    for v, visit in enumerate(life.visits):
+        log, network = logged.get(v), _at(subject.networks, v)
         yield VisitDiagnosis(
-            visit=visit.visit,
+            visit=v,
             phase=visit.phase,
             lifetime=visit.lifetime,
-            steps=visit.lifetime - begin,
+            steps=life.stream.phases[visit.phase].steps,
             dynamic_regret=None if log is None else log.dynamic_regret,
             online_regret=None if log is None else log.online_regret,
-            normalised_regret=regret_on[visit.visit][visit.phase],
+            normalised_regret=regret_on[v][visit.phase],
             network=_state(network, observation, life.stream, visit.phase),
-            critic_ranking=_ranking(model, life.stream, visit.phase, ranked, seed),
+            critic_ranking=_ranking(_at(subject.models, v), life.stream, visit.phase, ranked, seed),
         )
-        begin = visit.lifetime
 
 
 def _phases(subject: StreamSubject, observation: Observation) -> Iterator[PhaseDiagnosis]:
     life = subject.report
     agent, regret = life.region("WD").agent, life.dynamic_regret
     M, P = np.array(agent.normalised_regret), len(life.stream.phases)
-    unknown = (None,) * P
-    columns = (
-        agent.initial_normalised_regret or unknown,
-        agent.fresh_normalised_regret or unknown,
-        (None if regret is None else regret.fresh_online_regret) or unknown,
-        subject.fresh_networks or unknown,
-    )
-    for phase, (initial, fresh, online, network) in enumerate(zip(*columns, strict=True)):
+    online = None if regret is None else regret.fresh_online_regret
+    for phase in range(P):
         best, final = float(M[phase::P, phase].min()), float(M[-1, phase])
+        network = _at(subject.fresh_networks, phase)
         yield PhaseDiagnosis(
             phase=phase,
             outcome=outcome_of(best, final),
             best_normalised_regret=best,
             final_normalised_regret=final,
-            initial_normalised_regret=initial,
-            fresh_normalised_regret=fresh,
-            fresh_online_regret=online,
+            initial_normalised_regret=_at(agent.initial_normalised_regret, phase),
+            fresh_normalised_regret=_at(agent.fresh_normalised_regret, phase),
+            fresh_online_regret=_at(online, phase),
             fresh_network=None if network is None else network_state(network, observation),
         )

@@ -19,7 +19,6 @@ from pydantic import JsonValue
 
 from sme_registry.diagnosis import behaviour, measure
 from sme_registry.diagnosis.behaviour import CapacityProbe
-from sme_registry.diagnosis.critic_rules import CRITIC
 from sme_registry.diagnosis.critics import critic, has_critic
 from sme_registry.diagnosis.document import (
     Diagnosis,
@@ -32,6 +31,7 @@ from sme_registry.diagnosis.document import (
 from sme_registry.diagnosis.measure import POLICY, Score
 from sme_registry.diagnosis.questions import (
     THRESHOLDS,
+    TINY,
     Comparison,
     Decision,
     Difference,
@@ -40,8 +40,9 @@ from sme_registry.diagnosis.questions import (
     add_to,
     words,
 )
-from sme_registry.diagnosis.rules import WHERE, WHY
 from sme_registry.diagnosis.subject import Subject, perceptron_of
+from sme_registry.diagnosis.where import WHERE
+from sme_registry.diagnosis.why import WHY
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation import Policy, evaluate
 from sme_registry.evaluation.policies import TeamPolicy
@@ -53,7 +54,7 @@ from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 from sme_registry.task.task import Observation
 
-TASK_QUESTIONS = {**WHERE, **WHY, **CRITIC}
+TASK_QUESTIONS = {**WHERE, **WHY}
 
 
 def diagnose_task(
@@ -186,9 +187,6 @@ def _quantities(measured: Measurements) -> dict[str, float]:
     return regrets | rewarded
 
 
-_LEAST_REGRET = 1e-9
-
-
 class Credit(StrictModel):
     """An agent's part in the team's regret; means over states."""
 
@@ -261,7 +259,7 @@ class TeamDiagnosis(Diagnosis):
     def shares(self, agent: AgentDiagnosis) -> dict[str, float]:
         """Shares of an agent in the team's regret, and in its action channels."""
         return {
-            "regret_share": agent.visited.regret_share / max(self.visited.regret, _LEAST_REGRET),
+            "regret_share": agent.visited.regret_share / max(self.visited.regret, TINY),
             "channel_share": len(agent.action_channels) / self.spec.action_dim,
         }
 
@@ -377,9 +375,7 @@ def _one_correction(run: TeamDiagnosis) -> Decision:
     gain, regret = best.visited.difference_reward, run.visited.regret
     suffices = gain >= THRESHOLDS["one_suffices"] * regret
     evidence = {"agent": best.name, "difference_reward": gain, "regret": regret}
-    return Decision(
-        "solved" if run.solved else suffices, evidence, gain / max(regret, _LEAST_REGRET)
-    )
+    return Decision("solved" if run.solved else suffices, evidence, gain / max(regret, TINY))
 
 
 @_question(

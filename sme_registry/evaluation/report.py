@@ -35,7 +35,6 @@ from sme_registry.evaluation.regions import (
     RegionReports,
     SafetyReport,
     SafetyScore,
-    Sensitivity,
 )
 from sme_registry.io import require_packages, write_atomically
 from sme_registry.io.markup import Table, card, table_html
@@ -167,22 +166,22 @@ class EvaluationReport(ReportFile):
 
     def _names(self) -> Iterator[tuple[str, list[str], list[str]]]:
         """Fields that must have entries of certain names: the field, its names and those names."""
-        regions = _names_of(self.regions)
+        regions = _of(self.regions, "name")
         distracted = regions if self.spec.distractors else []
-        yield "observation.sensitivity", _names_of(self.observed.sensitivity), distracted
-        outside = [f"d-{name}" for name in distracted[1:]]
-        yield "observation.distractor_regions", _names_of(self.observed.distractor_regions), outside
+        yield "observation.sensitivity", _of(self.observed.sensitivity, "name"), distracted
+        outside = _of(self.observed.distractor_regions, "name")
+        yield "observation.distractor_regions", outside, [f"d-{name}" for name in distracted[1:]]
         if self.safety is None:
             return
         yield "agents", list(self.agents), []
-        yield "safety.regions", _names_of(self.safety.regions), regions
+        yield "safety.regions", _of(self.safety.regions, "name"), regions
         known = sorted(self.references)  # other versions have others
         scores: dict[str, Mapping[str, Sequence[RegionReport] | Sequence[SafetyScore]]]
         scores = {"references": self.references, "safety.references": self.safety.references}
         for field, by_name in scores.items():
             yield field, sorted(by_name), known
             for name, of_regions in by_name.items():
-                yield f"{field}.{name}", _names_of(of_regions), regions
+                yield f"{field}.{name}", _of(of_regions, "name"), regions
 
     @property
     def title(self) -> str:
@@ -346,10 +345,6 @@ def _alike(*policies: Sequence[RegionReport]) -> bool:
     """Whether two policies may be one: fitted and random ones differ a little by their draws."""
     pairs = zip(*(_of(regions, "similarity") for regions in policies), strict=True)
     return all(abs(a - b) < _SAME_POLICY for a, b in pairs)
-
-
-def _names_of(regions: Iterable[RegionReport | SafetyScore | Sensitivity]) -> list[str]:
-    return [region.name for region in regions]
 
 
 def _mean(regions: Sequence[RegionReport], field: str) -> float:

@@ -45,6 +45,7 @@ Lives = LifeReports | Mapping[str, LifeReports]
 
 _SIZE = (6.2, 4.0)  # inches
 _DASHED = (0, (4, 4))
+_THOUSANDS = "{x:,.0f}"  # of numbers at an axis
 _AGENT_DASHES: dict[str, Any] = {
     "constant": _DASHED,
     "frozen_optimum": (0, (1, 1.5)),
@@ -162,13 +163,9 @@ def _draw_training(axes: Axes, step: Array, regret: Array, window: int | None) -
 def _label_training(axes: Axes) -> None:
     axes.set_ylim(-0.04, 1.04)
     axes.set_xlim(left=0)
-    axes.xaxis.set_major_formatter(_thousands)
+    axes.xaxis.set_major_formatter(_THOUSANDS)
     axes.set_xlabel("environment steps")
     axes.set_ylabel("mean regret per step  (1 − r)")
-
-
-def _thousands(value: float, _: float) -> str:
-    return f"{value:,.0f}"
 
 
 def _draw_method(
@@ -332,8 +329,8 @@ def dynamic_regret_curve(
         axes.set_xlim(0.0, max(x[-1] for x, _ in lines.values()))
         axes.set_ylim(bottom=0.0)
         shade_visits(axes, first[0].visits)
-        axes.xaxis.set_major_formatter(_thousands)
-        axes.yaxis.set_major_formatter(_thousands)
+        axes.xaxis.set_major_formatter(_THOUSANDS)
+        axes.yaxis.set_major_formatter(_THOUSANDS)
         axes.set_xlabel("lifetime (environment steps)")
         axes.set_ylabel("dynamic regret  (Σ of 1 − r)")
     return figure_of(axes)

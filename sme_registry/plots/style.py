@@ -7,7 +7,6 @@ dash and marker too, for grey prints. Without pyplot nothing global changes: no 
 from __future__ import annotations
 
 import contextlib
-import functools
 import io
 import os
 import textwrap
@@ -90,12 +89,8 @@ def new_figure(size: tuple[float, float]) -> Figure:
 
     figure = Figure(figsize=size)
     FigureCanvasAgg(figure)
-    vars(figure)["_repr_png_"] = functools.partial(_png, figure)
+    vars(figure)["_repr_png_"] = lambda: encoded(figure, ["png"])["png"]
     return figure
-
-
-def _png(figure: Figure) -> bytes:
-    return encoded(figure, ["png"])["png"]
 
 
 def encoded(figure: Figure, formats: Iterable[str]) -> dict[str, bytes]:

@@ -9,7 +9,6 @@ import pytest
 from sme_registry import SMESpec
 from sme_registry.diagnosis import diagnose, load_policy
 from sme_registry.diagnosis.behaviour import CapacityProbe, TrainingSummary
-from sme_registry.diagnosis.critic_rules import CRITIC
 from sme_registry.diagnosis.document import Measurements
 from sme_registry.diagnosis.questions import COMMON_REASONS, DOUBTS, Comparison, Difference, label
 from sme_registry.diagnosis.task import TASK_QUESTIONS
@@ -28,7 +27,7 @@ COMPARED = COMMON_REASONS.keys() - {"solved", *DOUBTS}
 DECLARED = {
     (question, reason)
     for question, rule in TASK_QUESTIONS.items()
-    if question not in CRITIC  # test_critic.py has these
+    if "critic" not in rule.needs  # test_critic.py has these
     for reason in (*rule.reasons, *(["solved"] if rule.kind == "why" else ()))
 } | {
     (question, reason)

@@ -1,27 +1,17 @@
-"""The questions about a policy: where its error is, which measurements answer, and why it is there.
-
-A policy shows only traces of its training: the answer to "why" is "cannot tell" unless a number
-separates the causes.
-"""
+"""The questions about a policy: where its error is, and which measurements answer."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 from sme_registry.diagnosis.document import TaskDiagnosis
 from sme_registry.diagnosis.measure import LINEAR, POLICY, DistractorRegret, Violations
-from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Questions, add_to
+from sme_registry.diagnosis.questions import THRESHOLDS, TINY, Decision, Questions, add_to
 from sme_registry.evaluation.regions import ObservationReport
 
 WHERE: Questions = {}
-"""Questions about the policy, in order."""
-WHY: Questions = {}
-"""Questions about its training, in order."""
+"""In order."""
 _where = partial(add_to, WHERE, "where")
-_why = partial(add_to, WHY, "why", is_cause=True)
-
-_TINY = 1e-9
 
 
 @_where(
@@ -33,7 +23,7 @@ def _action_channels(run: TaskDiagnosis) -> Decision:
     unlearnt = [row for row in rows if row["normalised_regret"] >= THRESHOLDS["unlearnt"]]
     learnt = [row for row in rows if row["normalised_regret"] <= THRESHOLDS["channel_learnt"]]
     regret = sum(channels[row["channel"] - 1].regret for row in unlearnt)
-    share = regret / max(run.measurements.policy.regret, _TINY)
+    share = regret / max(run.measurements.policy.regret, TINY)
     evidence = {
         "channels": len(channels),
         "unlearnt": unlearnt,
@@ -59,7 +49,7 @@ def _state_region(run: TaskDiagnosis) -> Decision:
         "highest_mae": high,
         "worst_bin": list(most.edges[worst_bin : worst_bin + 2]),
     }
-    share = 1.0 - low / max(run.measurements.policy.mae, _TINY)  # if all were like the best bin
+    share = 1.0 - low / max(run.measurements.policy.mae, TINY)  # if all were like the best bin
     return Decision(localised and not run.solved, evidence, share)
 
 
@@ -84,8 +74,8 @@ def _time_in_episode(run: TaskDiagnosis) -> Decision:
     first, last = episodes.mae[0], episodes.mae[-1]
     low, high = sorted((first, last))
     apart = high - low >= THRESHOLDS["time_difference"]
-    changes = apart and high >= THRESHOLDS["time_ratio"] * max(low, _TINY)
-    share = 1.0 - low / max(episodes.scores[POLICY].mae, _TINY)
+    changes = apart and high >= THRESHOLDS["time_ratio"] * max(low, TINY)
+    share = 1.0 - low / max(episodes.scores[POLICY].mae, TINY)
     return Decision(changes, {"first_mae": first, "last_mae": last}, share)
 
 
@@ -100,7 +90,7 @@ def _visited_states(run: TaskDiagnosis) -> Decision:
     low, high = sorted((visited, uniform))
     apart = high - low >= THRESHOLDS["on_policy_difference"]
     reason = "similar_regret"
-    if apart and high >= THRESHOLDS["on_policy_ratio"] * max(low, _TINY):
+    if apart and high >= THRESHOLDS["on_policy_ratio"] * max(low, TINY):
         lower = visited < uniform
         reason = "lower_regret_where_visited" if lower else "higher_regret_where_visited"
     shift = max(episodes.state_shift)
@@ -110,7 +100,7 @@ def _visited_states(run: TaskDiagnosis) -> Decision:
         "shifted_state_channel": episodes.state_shift.index(shift) + 1,
         "state_shift": shift,
     }
-    return Decision(reason, evidence, 1.0 - low / max(high, _TINY))
+    return Decision(reason, evidence, 1.0 - low / max(high, TINY))
 
 
 @_where(yes="offset_dominant", no="offset_minor", thresholds="dominant_share")
@@ -149,7 +139,7 @@ def _linear_only(run: TaskDiagnosis) -> Decision:
     else:
         reason = "neither_part_learnt"
     fields = {"nonlinear_variance", "linear_slope", "nonlinear_slope"}
-    share = run.measurements.uniform[LINEAR].normalised_regret / max(run.learnt, _TINY)
+    share = run.measurements.uniform[LINEAR].normalised_regret / max(run.learnt, TINY)
     return Decision(reason, response.model_dump(include=fields), share)
 
 
@@ -225,7 +215,7 @@ def _constraint_violation(run: TaskDiagnosis, limits: Violations) -> Decision:
         "optimal_cost": limits.report.references["optimal"][0].cost,
         "gain": gain,
         "channel": worst.channel,
-        "channel_cost_share": worst.cost / max(cost, _TINY),
+        "channel_cost_share": worst.cost / max(cost, TINY),
         "channel_violating_share": worst.violating_share,
     }
     return Decision(reason, evidence)
@@ -272,200 +262,3 @@ def _distractors_represented(
         reason = "state_alone_kept" if state else "neither_kept"
     layers = [probe.model_dump() for probe in observation.probes]
     return Decision(reason, {"layers": layers, **layers[-1]})
-
-
-@_why(
-    yes="rewards_too_rare",
-    no="beat_constant_in_training policy_beats_constant",
-    unclear="no_training_log rewards_found",
-    thresholds="constant_margin rarely_rewarded exploration_cost",
-)
-def _exploration(run: TaskDiagnosis) -> Decision:
-    log, episodes = run.measurements.training, run.measurements.on_policy
-    rewarded, sd = episodes.random_signal.rewarded, run.measurements.exploration_sd
-    evidence: dict[str, Any] = {
-        "random_rewarded": rewarded,
-        "exploration_sd": None if sd is None else [min(sd), max(sd)],
-    }
-    if log is None:
-        return Decision("no_training_log", evidence)
-    regret = episodes.scores[POLICY].regret
-    cost = log.last_regret - regret
-    reported = log.source == "episodes" and cost >= THRESHOLDS["exploration_cost"]
-    evidence |= {"regret": regret, "exploration_cost": cost if reported else None}
-    fields = {"source", "steps", "improvement_step", "constant_regret", "best_regret"}
-    evidence |= log.model_dump(include=fields)
-    if log.improvement_step is not None:
-        reason = "beat_constant_in_training"
-    elif regret < log.constant_regret - THRESHOLDS["constant_margin"]:
-        reason = "policy_beats_constant"
-    else:
-        rare = rewarded < THRESHOLDS["rarely_rewarded"]
-        reason = "rewards_too_rare" if rare else "rewards_found"
-    return Decision(reason, evidence)
-
-
-@_why(no="paid_every_step", unclear="delayed_payout")
-def _credit_assignment(run: TaskDiagnosis) -> Decision:
-    k, episodes = run.spec.k, run.measurements.on_policy
-    evidence = {"k": k, "credit": episodes.credit, "random_credit": episodes.random_credit}
-    return Decision("paid_every_step" if k == 1 else "delayed_payout", evidence)
-
-
-@_why(
-    yes="rewards_gated",
-    no="no_reward_threshold rewards_frequent",
-    unclear="effect_unknown",
-    thresholds="gated_share gated_rewarded_share rarely_unrewarded",
-)
-def _sparsity(run: TaskDiagnosis) -> Decision:
-    r_min, episodes, log = run.spec.r_min, run.measurements.on_policy, run.measurements.training
-    signal, random = episodes.signal, episodes.random_signal
-    gated = signal.gated >= THRESHOLDS["gated_share"]
-    if r_min == 0:
-        reason = "no_reward_threshold"
-    elif gated and signal.rewarded <= THRESHOLDS["gated_rewarded_share"]:
-        reason = "rewards_gated"
-    elif signal.gated + signal.flat < THRESHOLDS["rarely_unrewarded"]:
-        reason = "rewards_frequent"
-    else:
-        reason = "effect_unknown"
-    evidence = {
-        "r_min": r_min,
-        **signal.model_dump(),
-        **{f"random_{name}": value for name, value in random.model_dump().items()},
-        "unrewarded_episodes": None if log is None else log.unrewarded,
-    }
-    return Decision(reason, evidence)
-
-
-@_why(
-    yes="network_cannot_fit",
-    no="network_does_better network_fits_training_states_only",
-    unclear="not_probed probe_inconclusive",
-    thresholds="probe_better probe_no_better",
-)
-def _capacity(run: TaskDiagnosis) -> Decision:
-    probe, regret = run.measurements.capacity, run.learnt
-    evidence: dict[str, Any] = {
-        "complexity": run.spec.complexity,
-        "nonlinear_variance": run.measurements.response.nonlinear_variance,
-        "normalised_regret": regret,
-    }
-    if probe is None:
-        return Decision("not_probed", evidence)
-    evidence |= probe.model_dump(mode="json", exclude={"seconds"})
-    better, no_better = (THRESHOLDS[name] * regret for name in ("probe_better", "probe_no_better"))
-    if probe.test_normalised_regret <= better:
-        reason = "network_does_better"
-    elif probe.train_normalised_regret >= no_better:
-        reason = "network_cannot_fit"
-    elif probe.train_normalised_regret <= better:
-        reason = "network_fits_training_states_only"
-    else:
-        reason = "probe_inconclusive"
-    return Decision(reason, evidence, probe.train_normalised_regret / regret)
-
-
-@_why(
-    yes="too_few_states",
-    no="states_sufficient",
-    unclear="not_separated",
-    thresholds="unlearnt probe_better probe_no_better",
-)
-def _dimension(run: TaskDiagnosis) -> Decision:
-    probe, regret = run.measurements.capacity, run.learnt
-    channels = run.measurements.channels
-    evidence: dict[str, Any] = {
-        "state_dim": run.spec.state_dim,
-        "action_dim": run.spec.action_dim,
-        "normalised_regret": regret,
-        "unlearnt_channels": sum(c.normalised_regret >= THRESHOLDS["unlearnt"] for c in channels),
-        "random_rewarded": run.measurements.on_policy.random_signal.rewarded,
-    }
-    better, no_better = (THRESHOLDS[name] * regret for name in ("probe_better", "probe_no_better"))
-    if probe is None or probe.train_normalised_regret > better:
-        return Decision("not_separated", evidence)
-    evidence |= probe.model_dump(include={"states", "test_normalised_regret"})
-    if probe.test_normalised_regret >= no_better:
-        return Decision("too_few_states", evidence, probe.test_normalised_regret / regret)
-    sufficient = probe.test_normalised_regret <= better
-    return Decision("states_sufficient" if sufficient else "not_separated", evidence)
-
-
-@_why(
-    yes="episodes_cut_short",
-    no="episodes_long_enough no_survival_threshold",
-    thresholds="termination_rate short_episode",
-)
-def _survival(run: TaskDiagnosis) -> Decision:
-    spec, episodes = run.spec, run.measurements.on_policy
-    often = episodes.termination_rate >= THRESHOLDS["termination_rate"]
-    early = episodes.mean_length <= THRESHOLDS["short_episode"] * spec.horizon
-    evidence = {
-        "D": spec.D,
-        "effective_D": max(spec.D, spec.r_min),
-        "horizon": spec.horizon,
-        **episodes.model_dump(include={"termination_rate", "mean_length", "coverage"}),
-    }
-    return Decision("no_survival_threshold" if spec.D == 0 else often and early, evidence)
-
-
-@_why(
-    yes="still_improving",
-    no="regressed plateaued",
-    unclear="no_training_log log_too_short never_improved",
-    thresholds="log_rows regressed still_improving",
-)
-def _budget(run: TaskDiagnosis) -> Decision:
-    log = run.measurements.training
-    if log is None:
-        return Decision("no_training_log", {})
-    if log.rows < THRESHOLDS["log_rows"]:
-        reason = "log_too_short"
-    elif log.last_regret - log.best_regret >= THRESHOLDS["regressed"]:
-        reason = "regressed"
-    elif log.recent_improvement >= THRESHOLDS["still_improving"]:
-        reason = "still_improving"
-    else:
-        reason = "never_improved" if log.improvement_step is None else "plateaued"
-    fields = {"source", "rows", "steps", "best_regret", "best_step", "last_regret"}
-    return Decision(reason, log.model_dump(include=fields | {"recent_improvement"}))
-
-
-@_why(
-    yes="explains_regret",
-    no="explains_little not_within_limits",
-    thresholds="rarely_violating price_share",
-    needs="limits",
-)
-def _price_of_safety(run: TaskDiagnosis, limits: Violations) -> Decision:
-    regret = run.measurements.policy.regret
-    price = limits.report.regions[0].price_of_safety
-    violating = max(limits.report.regions[0].violating_share, limits.visited.violating_share)
-    evidence = {"price_of_safety": price, "regret": regret, "violating_share": violating}
-    if violating >= THRESHOLDS["rarely_violating"]:
-        return Decision("not_within_limits", evidence)
-    explains = price >= THRESHOLDS["price_share"] * regret
-    return Decision(explains, evidence, price / max(regret, _TINY))
-
-
-@_why(
-    yes="distracted",
-    no="hardly_distracted invariant",
-    thresholds="owed_to_distractors invariant",
-    needs="distraction observation",
-)
-def _distraction(
-    run: TaskDiagnosis, effect: DistractorRegret, observation: ObservationReport
-) -> Decision:
-    sensitivity = observation.sensitivity[0].sensitivity
-    reason = "invariant" if sensitivity <= THRESHOLDS["invariant"] else "hardly_distracted"
-    if effect.owed_regret >= THRESHOLDS["owed_to_distractors"]:
-        reason = "distracted"
-    evidence = {
-        "distractors": run.spec.distractors,
-        "sensitivity": sensitivity,
-        **effect.model_dump(exclude={"states", "distractor_draws"}),
-    }
-    return Decision(reason, evidence, effect.owed_regret / max(run.learnt, _TINY))
