@@ -203,7 +203,7 @@ def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:
         within = [name for name in changed if name.startswith(f"{block}.")]
         both = getattr(member.setting, block) and getattr(first.setting, block)
         values = [of.get(name) for of in (setting, base) for name in within]
-        is_axis = len(within) == 1 and (both or is_numeric(values))
+        is_axis = len(within) == 1 and (both or is_numeric(values)) and within != ["team.agents"]
         differing += within if is_axis else [block] * bool(within)
         setting[block] = _block_text(getattr(member.setting, block))
     if len(differing) > 1 and "policy_init" in differing:
@@ -214,13 +214,16 @@ def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:
 
 
 def _setting(member: SuiteClass) -> dict[str, Any]:
-    """Every field by its dotted name; numbers of a block that the setting lacks are 0."""
-    setting = _flat(member.setting.every_field())
-    for block in BLOCKS:
-        if setting.pop(block, 0) is None:
-            fields = fields_of_block(block).items()
-            numbers = (n for n, field in fields if number_type(field) and field.default is not None)
-            setting |= {f"{block}.{name}": 0 for name in numbers}
+    """Every field, those of blocks by dotted names; numbers of a block that it lacks are 0."""
+    setting: dict[str, Any] = {}
+    for name, value in member.setting.every_field().items():
+        if name not in BLOCKS:
+            setting[name] = value
+            continue
+        fields = fields_of_block(name).items()
+        numbers = (n for n, field in fields if number_type(field) and field.default is not None)
+        values = dict.fromkeys(numbers, 0) if value is None else value
+        setting |= {f"{name}.{inner}": part for inner, part in values.items()}
     return setting
 
 
@@ -230,18 +233,6 @@ def _block_text(block: TeamSpec | Document | None) -> str:
         return f"{len(block.agents)} agents"
     values = {} if block is None else block.model_dump(exclude_defaults=True)
     return " ".join(str(value) for value in values.values()) or "none"
-
-
-def _flat(fields: Any, prefix: str = "") -> dict[str, Any]:
-    """The values of nested plain data by their dotted names; lists of numbers are values."""
-    flat: dict[str, Any] = {}
-    for key, value in fields.items() if isinstance(fields, dict) else enumerate(fields):
-        name = f"{prefix}{key}"
-        nested = isinstance(value, dict) or (
-            isinstance(value, list) and any(isinstance(item, dict) for item in value)
-        )
-        flat |= _flat(value, f"{name}.") if nested else {name: value}
-    return flat
 
 
 def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
