@@ -16,26 +16,27 @@ PROTOCOL = {"states_per_region": 2, "epsilons": [1.0]}
 STARTED, GATE = "started", "gate"
 
 
+def file_of(name, **fields):
+    """The file of a plan with these fields."""
+    plan = StudyPlan.from_dict(fields)
+    return StudyFile(name=name, description="For tests.", digest=plan.digest, plan=plan)
+
+
 def small_file(seeds=2, algorithms=("constant",), **fields):
     """References, or other algorithms, on one small class, `seeds` runs each: milliseconds each."""
-    plan = StudyPlan.from_dict(
-        {
-            "classes": [
-                {"name": "small", "setting": {"state_dim": 2, "action_dim": 2}, "seeds": [1, 2]}
-            ],
-            "algorithms": [
-                {"name": one, "uses": f"reference:{one}", "steps": 0}
-                if isinstance(one, str)
-                else one
-                for one in algorithms
-            ],
-            "seeds": seeds,
-            "evaluations": 0,
-            "protocol": PROTOCOL,
-            **fields,
-        }
-    )
-    return StudyFile(name="small", description="For tests.", digest=plan.digest, plan=plan)
+    fields = {
+        "classes": [
+            {"name": "small", "setting": {"state_dim": 2, "action_dim": 2}, "seeds": [1, 2]}
+        ],
+        "algorithms": [
+            {"name": one, "uses": f"reference:{one}", "steps": 0} if isinstance(one, str) else one
+            for one in algorithms
+        ],
+        "seeds": seeds,
+        "evaluations": 0,
+        "protocol": PROTOCOL,
+    } | fields
+    return file_of("small", **fields)
 
 
 def noted(folder, cell, progress=None, model_path=None):

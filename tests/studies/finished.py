@@ -2,11 +2,11 @@
 
 import dataclasses
 
-from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.result import CellFailure
+from tests.studies.cells import file_of
 
 LEARNERS = {
     "Alpha": {"half_life": 10.0, "r_min": 0.7, "k": 0.02},
@@ -27,29 +27,23 @@ def study_file(classes=CLASSES, learners=LEARNERS, **fields):
         {"name": name, "uses": "tests.studies.learners:blend", "hyperparameters": own}
         for name, own in learners.items()
     ]
-    plan = StudyPlan.from_dict(
-        {
-            "classes": [
-                {
-                    "name": name,
-                    "setting": {"state_dim": 8, "action_dim": 4, "horizon": 20, **setting},
-                    "seeds": list(range(1, 6)),
-                }
-                for name, setting in classes.items()
-            ],
-            "algorithms": [
-                *algorithms,
-                {"name": "constant", "uses": "reference:constant", "steps": 0},
-            ],
-            "seeds": 5,
-            "steps": 40,
-            "evaluations": 20,
-            "evaluation_episodes": 3,
-            "protocol": {"states_per_region": 100, "epsilons": [0.5, 1.0]},
-            **fields,
-        }
-    )
-    return StudyFile(name="finished", description="For tests.", digest=plan.digest, plan=plan)
+    small = {"state_dim": 8, "action_dim": 4, "horizon": 20}
+    fields = {
+        "classes": [
+            {"name": name, "setting": small | setting, "seeds": [1, 2, 3, 4, 5]}
+            for name, setting in classes.items()
+        ],
+        "algorithms": [
+            *algorithms,
+            {"name": "constant", "uses": "reference:constant", "steps": 0},
+        ],
+        "seeds": 5,
+        "steps": 40,
+        "evaluations": 20,
+        "evaluation_episodes": 3,
+        "protocol": {"states_per_region": 100, "epsilons": [0.5, 1.0]},
+    } | fields
+    return file_of("finished", **fields)
 
 
 def finish(folder):

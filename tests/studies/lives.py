@@ -18,9 +18,10 @@ from sme_registry.evaluation import (
     reference_regret,
 )
 from sme_registry.evaluation.retention import final_specs
-from sme_registry.spec import StreamSpec, StudyFile, StudyPlan
+from sme_registry.spec import StreamSpec
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.result import CellResult, LearningCurve, Timing
+from tests.studies.cells import file_of
 
 AGENTS = ("Forgetful", "Tired", "Stubborn")
 TASK = {"state_dim": 2, "action_dim": 2, "complexity": 2, "horizon": 10, "hidden_width": 8}
@@ -40,21 +41,18 @@ STREAMS = {
 
 def stream_study(seeds=5, **fields):
     """The plan; each stream has two draws."""
-    plan = StudyPlan.from_dict(
-        {
-            "streams": [
-                {"name": name, "stream": each, "draws": [0, 1]} for name, each in STREAMS.items()
-            ],
-            "algorithms": [
-                {"name": name, "uses": "PPO", "hyperparameters": {"agent": name}} for name in AGENTS
-            ],
-            "seeds": seeds,
-            "evaluations": 12,
-            "protocol": {"states_per_region": 30, "epsilons": [0.5, 1.0]},
-            **fields,
-        }
-    )
-    return StudyFile(name="lived", description="For tests.", digest=plan.digest, plan=plan)
+    fields = {
+        "streams": [
+            {"name": name, "stream": each, "draws": [0, 1]} for name, each in STREAMS.items()
+        ],
+        "algorithms": [
+            {"name": name, "uses": "PPO", "hyperparameters": {"agent": name}} for name in AGENTS
+        ],
+        "seeds": seeds,
+        "evaluations": 12,
+        "protocol": {"states_per_region": 30, "epsilons": [0.5, 1.0]},
+    } | fields
+    return file_of("lived", **fields)
 
 
 def live(file, folder, leave_out=lambda planned: False):

@@ -7,11 +7,11 @@ import pytest
 from rich.console import Console
 
 from sme_registry.errors import OptionError
-from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.executors import InProcess
 from sme_registry.studies.ledger import Ledger, write_state
 from sme_registry.studies.result import failed
 from sme_registry.studies.runner import run_study
+from tests.studies.cells import file_of
 
 pytest.importorskip("jax")
 
@@ -21,23 +21,20 @@ from sme_registry.studies.programs import Programs
 def plan_file(seeds=3, **fields):
     """Two classes of one group and a third that cannot share their program, and a reference."""
     small = {"state_dim": 2, "action_dim": 2}
-    plan = StudyPlan.from_dict(
-        {
-            "classes": [
-                {"name": "small", "setting": small, "seeds": [1, 2]},
-                {"name": "gated", "setting": small | {"r_min": 0.5}, "seeds": [1, 2]},
-                {"name": "delayed", "setting": small | {"k": 5}, "seeds": [1, 2]},
-            ],
-            "algorithms": [
-                {"name": "PPO", "uses": "jax:PPO"},
-                {"name": "linear", "uses": "reference:linear", "steps": 0},
-            ],
-            "seeds": seeds,
-            "evaluations": 0,
-            **fields,
-        }
-    )
-    return StudyFile(name="lanes", digest=plan.digest, plan=plan)
+    fields = {
+        "classes": [
+            {"name": "small", "setting": small, "seeds": [1, 2]},
+            {"name": "gated", "setting": small | {"r_min": 0.5}, "seeds": [1, 2]},
+            {"name": "delayed", "setting": small | {"k": 5}, "seeds": [1, 2]},
+        ],
+        "algorithms": [
+            {"name": "PPO", "uses": "jax:PPO"},
+            {"name": "linear", "uses": "reference:linear", "steps": 0},
+        ],
+        "seeds": seeds,
+        "evaluations": 0,
+    } | fields
+    return file_of("lanes", **fields)
 
 
 def cells(file, *classes):

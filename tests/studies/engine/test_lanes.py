@@ -14,7 +14,6 @@ import pytest
 from rich.console import Console
 
 from sme_registry.evaluation import evaluate
-from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.executors import InProcess
 from sme_registry.studies.ledger import Ledger, read_header, read_state, write_state
@@ -24,7 +23,7 @@ from sme_registry.studies.report.texts import implementation_caveats
 from sme_registry.studies.report.write import page
 from sme_registry.studies.result import CellResult
 from sme_registry.studies.runner import run_study
-from tests.studies.cells import numbers
+from tests.studies.cells import file_of, numbers
 
 pytest.importorskip("jax")
 pytest.importorskip("stable_baselines3")
@@ -53,25 +52,22 @@ def plan_file(uses="jax:PPO", **fields):
     settings = {"policy_kwargs": {"net_arch": [8, 8]}} | (
         {"n_steps": 32, "batch_size": 16, "n_epochs": 2} if "PPO" in uses else {"batch_size": 16}
     )
-    plan = StudyPlan.from_dict(
-        {
-            "classes": [
-                {"name": "small", "setting": small, "seeds": [1, 2]},
-                {"name": "gated", "setting": small | {"r_min": 0.5}, "seeds": [1, 2]},
-            ],
-            "algorithms": [
-                {"name": "agent", "uses": uses, "hyperparameters": settings},
-                {"name": "linear", "uses": "reference:linear", "steps": 0},
-            ],
-            "seeds": 2,
-            "steps": STEPS,
-            "evaluations": 4,
-            "evaluation_episodes": 2,
-            "protocol": {"states_per_region": 20, "epsilons": [1.0]},
-        }
-        | fields
-    )
-    return StudyFile(name="lanes", digest=plan.digest, plan=plan)
+    fields = {
+        "classes": [
+            {"name": "small", "setting": small, "seeds": [1, 2]},
+            {"name": "gated", "setting": small | {"r_min": 0.5}, "seeds": [1, 2]},
+        ],
+        "algorithms": [
+            {"name": "agent", "uses": uses, "hyperparameters": settings},
+            {"name": "linear", "uses": "reference:linear", "steps": 0},
+        ],
+        "seeds": 2,
+        "steps": STEPS,
+        "evaluations": 4,
+        "evaluation_episodes": 2,
+        "protocol": {"states_per_region": 20, "epsilons": [1.0]},
+    } | fields
+    return file_of("lanes", **fields)
 
 
 class Watched(InProcess):

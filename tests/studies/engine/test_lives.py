@@ -10,7 +10,6 @@ from rich.console import Console
 from sme_registry import SMESpec, StreamSpec, materialize
 from sme_registry.errors import PolicyError, SMEError, SpecError
 from sme_registry.evaluation import evaluate_stream, expected_regret
-from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger, label, study_status
@@ -18,7 +17,7 @@ from sme_registry.studies.result import CellResult
 from sme_registry.studies.runner import run_study
 from sme_registry.training.algorithms import find
 from sme_registry.training.record import Snapshots
-from tests.studies.cells import numbers
+from tests.studies.cells import file_of, numbers
 
 pytest.importorskip("stable_baselines3")
 
@@ -53,25 +52,19 @@ def life(stream=TWICE, uses="PPO", **changes):
 
 def plan_file(uses="PPO", **fields):
     """Two streams that share phase 0, two runs each."""
-    plan = StudyPlan.from_dict(
-        {
-            "streams": [
-                {"name": "switch", "stream": stream_of(TASK, OTHER).to_dict(), "draws": [0, 1]},
-                {
-                    "name": "related",
-                    "stream": stream_of(TASK, TASK.derive(rotation=1.0)).to_dict(),
-                    "draws": [0, 1],
-                },
-            ],
-            "algorithms": [{"name": "agent", "uses": uses, "hyperparameters": SMALL}],
-            "seeds": 2,
-            "evaluations": 4,
-            "evaluation_episodes": 2,
-            "protocol": PROTOCOL,
-        }
-        | fields
-    )
-    return StudyFile(name="lives", digest=plan.digest, plan=plan)
+    second = {"switch": OTHER, "related": TASK.derive(rotation=1.0)}
+    fields = {
+        "streams": [
+            {"name": name, "stream": stream_of(TASK, spec).to_dict(), "draws": [0, 1]}
+            for name, spec in second.items()
+        ],
+        "algorithms": [{"name": "agent", "uses": uses, "hyperparameters": SMALL}],
+        "seeds": 2,
+        "evaluations": 4,
+        "evaluation_episodes": 2,
+        "protocol": PROTOCOL,
+    } | fields
+    return file_of("lives", **fields)
 
 
 def matrix(report, region="WD"):

@@ -12,12 +12,12 @@ import pytest
 
 from sme_registry.errors import OptionError
 from sme_registry.io import read_json
-from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.frames import records
 from tests.commands import good, refused
+from tests.studies.cells import small_file
 
 pytest.importorskip("matplotlib")
 
@@ -191,22 +191,12 @@ def test_latex_tables_are_ascii_and_scaled_to_the_column(written):
 
 def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     pytest.importorskip("stable_baselines3")
-    setting = {"state_dim": 2, "action_dim": 2}
-    plan = StudyPlan.from_dict(
-        {
-            "classes": [{"name": "plane", "setting": setting, "seeds": [1]}],
-            "algorithms": [
-                {"name": "PPO", "uses": "PPO", "hyperparameters": {"n_steps": 64, "n_epochs": 1}}
-            ],
-            "seeds": 1,
-            "steps": 64,
-            "evaluations": 1,
-            "protocol": {"states_per_region": 50, "epsilons": [1.0]},
-        }
-    )
+    ppo = {"name": "PPO", "uses": "PPO", "hyperparameters": {"n_steps": 64, "n_epochs": 1}}
+    protocol = {"states_per_region": 50, "epsilons": [1.0]}
+    file = small_file(1, [ppo], steps=64, evaluations=1, protocol=protocol)
     ledger = Ledger(tmp_path)
-    ledger.write_plan(StudyFile(name="maps", digest=plan.digest, plan=plan))
-    (planned,) = plan.cells
+    ledger.write_plan(file)
+    (planned,) = file.plan.cells
     model = tmp_path / "model.zip"
     result = run_cell(planned.cell, model_path=model)
     ledger.write(result)
@@ -216,7 +206,7 @@ def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     page, explorer = write_report(tmp_path, formats=["html"], explorers=True)
     assert "figure-maps" in Page(page.read_text()).ids
     assert explorer.parent == page.parent / "explorers"
-    assert f'<a href="explorers/{explorer.name}">PPO on plane, run 0</a>' in page.read_text()
+    assert f'<a href="explorers/{explorer.name}">PPO on small, run 0</a>' in page.read_text()
     assert '"of":"observation"' in explorer.read_text()
     assert '"regions":{"names":["WD"' in explorer.read_text()
     good("diagnose", "--explore", tmp_path, "--cell", result.key, "--out", tmp_path / "one.html")

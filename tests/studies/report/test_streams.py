@@ -26,6 +26,7 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report.write import page, write_report
 from tests.geometry import assert_readable
+from tests.studies.report.test_findings import found
 from tests.studies.report.test_report import Page
 
 FIGURES = {
@@ -69,14 +70,6 @@ def streams(study):
 def text_of(analysis):
     """The text of the page, without figures and tables."""
     return Page(page(analysis)).text
-
-
-def found(analysis, **at):
-    """The rows of findings with these values, by question."""
-    rows = findings(analysis)
-    for name, value in at.items():
-        rows = rows[rows[name] == value]
-    return {row.question: row for row in rows.itertuples()}
 
 
 def within(rows, **at):
