@@ -21,7 +21,7 @@ from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError
 from leaderboard.scoring import ranking
 from leaderboard.scoring.ranking import REASONS, RankedRow
-from leaderboard.scoring.verify import VerifyReport
+from leaderboard.scoring.verify import Findings
 from leaderboard.scoring.verify import verify as verify_board
 from leaderboard.store import Store
 from leaderboard.web import client
@@ -427,14 +427,16 @@ def verify(
             progress=lambda what: status.update(f"verifying {escape(what)}"),
         )
     if json:
-        print_json({**asdict(report), "is_confirmed": report.is_confirmed})
+        plain = {**asdict(report), "is_confirmed": report.is_confirmed}
+        del plain["progress"]
+        print_json(plain)
     else:
         _print_verification(report)
     if not report.is_confirmed:
         raise typer.Exit(1)
 
 
-def _print_verification(report: VerifyReport) -> None:
+def _print_verification(report: Findings) -> None:
     columns = {"": "text", "checked": "number", "not checked": "number", "why": "text"}
     table = Table("What was checked", columns)
     for row in report.rows:

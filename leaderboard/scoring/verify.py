@@ -82,11 +82,20 @@ class Note:
 
 @dataclass
 class Findings:
-    """What was checked so far, and what this machine does not confirm."""
+    """What was checked, what this machine does not confirm, and what is not in this folder."""
 
-    progress: Progress
+    progress: Progress = field(compare=False, repr=False)
+    log_sequence: int = -1  # of the last log entry
+    log_digest: str = ""  # which, kept elsewhere, shows later whether the log was cut or rewritten
     rows: list[Row] = field(default_factory=list)
     notes: list[Note] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)  # published files
+    rescore_seed: int | None = None  # repeats the draw of the submissions that were scored again
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether nothing that was checked differs, and nothing that is public is missing."""
+        return not self.notes and not self.missing
 
     def report(self, what: str, checked: int, unchecked: int = 0, why: str = "") -> None:
         self.rows.append(Row(what, checked, unchecked, why))
@@ -117,23 +126,6 @@ Part = Callable[[Store, Findings], None]
 """Verifies a part of a board whose log was followed."""
 
 
-@dataclass(frozen=True)
-class VerifyReport:
-    """What was verified."""
-
-    log_sequence: int  # of the last log entry
-    log_digest: str  # which, kept elsewhere, shows later whether the log was cut or rewritten
-    rows: tuple[Row, ...]  # what was checked, and what was not
-    notes: tuple[Note, ...]  # the entries that are not confirmed here
-    missing: tuple[str, ...]  # published files that are not in this folder
-    rescore_seed: int | None  # repeats the draw of the submissions that were scored again
-
-    @property
-    def is_confirmed(self) -> bool:
-        """Whether nothing that was checked differs, and nothing that is public is missing."""
-        return not self.notes and not self.missing
-
-
 def verify(
     path: str | Path,
     *,
@@ -143,7 +135,7 @@ def verify(
     board: type[Store] = Store,
     parts: Sequence[Part] = (),
     progress: Progress | None = None,
-) -> VerifyReport:
+) -> Findings:
     """Verify a board without writing anything; a `TamperedError` names the first altered value.
 
     `rescore` submissions are scored again, drawn by `seed`, by default the system's randomness,
@@ -161,23 +153,18 @@ def verify(
             _check_numbering(store, head.sequence + 1)
         if digest is not None:
             _check_contains(store, digest)
-        findings = Findings(progress or (lambda _: None))
+        findings = Findings(progress or (lambda _: None), head.sequence, head.digest)
+        findings.report("log entries, and their documents", head.sequence + 1)
         verifier = _Verifier(store, findings)
         verifier.check_signatures()
         verifier.check_files()
         scored = verifier.check_results()
         drawn = draw(scored, rescore, seed)
+        findings.rescore_seed = seed if drawn else None
         verifier.score_again(drawn, len(scored))
         for part in parts:
             part(store, findings)
-    return VerifyReport(
-        log_sequence=head.sequence,
-        log_digest=head.digest,
-        rows=(Row("log entries, and their documents", head.sequence + 1), *findings.rows),
-        notes=tuple(findings.notes),
-        missing=tuple(verifier.missing),
-        rescore_seed=seed if drawn else None,
-    )
+    return findings
 
 
 def draw(ids: Sequence[str], count: int | Literal["all"], seed: int) -> list[str]:
@@ -309,7 +296,6 @@ class _Verifier:
 
     store: Store
     findings: Findings
-    missing: list[str] = field(default_factory=list)
 
     def check_signatures(self) -> None:
         """Check the submitters' signatures, which the board's own key cannot forge."""
@@ -339,12 +325,13 @@ class _Verifier:
             self.findings.progress(digest)
         named = self.store.named_objects()
         absent = [digest for digest in named if not self.store.objects.has(digest)]
-        self.missing += [digest for digest in absent if self.store.is_public(digest)]
-        secret = len(absent) - len(self.missing)
+        missing = [digest for digest in absent if self.store.is_public(digest)]
+        self.findings.missing += missing
+        secret = len(absent) - len(missing)
         why = "not published" * bool(secret)
         self.findings.report("files by their digests", count, secret, why)
-        if self.missing:
-            self.findings.report("published files", 0, len(self.missing), "not in this folder")
+        if missing:
+            self.findings.report("published files", 0, len(missing), "not in this folder")
 
     def check_results(self) -> list[str]:
         """Check that the scores of each result follow from its runs; returns the submissions."""

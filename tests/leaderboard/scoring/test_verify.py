@@ -220,7 +220,7 @@ def test_an_altered_policy_file_is_named_and_a_missing_one_is_reported(board):
     assert_named(board, path, b"", path.read_bytes()[:-1] + b"!")
     path.unlink()
     report = verify(board, rescore="all")
-    assert report.missing == (runs[ids(board)[STEADY]].artefact.sha256,)
+    assert report.missing == [runs[ids(board)[STEADY]].artefact.sha256]
     assert not report.is_confirmed
     assert table(report)["results, scored again"] == (3, 1)
     Folder(board).object(runs[ids(board)[WAITING]].artefact.sha256).unlink()  # not public yet
@@ -272,7 +272,7 @@ def test_a_result_of_an_earlier_version_that_gives_single_runs_an_interval_is_ac
 def test_a_board_of_rules_2_is_read_where_its_documents_lie_and_accepts_nothing(tmp_path):
     board = shutil.copytree(SEASONS, tmp_path / "board")
     report = verify(board, board=SeasonStore)
-    assert (report.log_sequence, len(report.missing), report.notes) == (30, 6, ())
+    assert (report.log_sequence, len(report.missing), report.notes) == (30, 6, [])
     with SeasonStore.open(board) as store:
         decays = [store.result(row.id).scores.ood_decay.value for row in store.entries()]
         assert decays == pytest.approx([0.0, 0.0], abs=1e-6)  # N̄ − N₀ of π* and of ½
