@@ -267,18 +267,18 @@ def _public_view(board: str, id: str) -> PublicView:
 
 def _print_submission(view: PublicView) -> None:
 
-    submission = view.signed.content
+    submission = view.content
     method, runs = submission.method, submission.runs
     total = sum(run.steps for run in runs)
     steps = sorted({run.steps for run in runs if run.artefact is not None})
-    each = "–".join(f"{one:,}" for one in dict.fromkeys((*steps[:1], *steps[-1:])))
+    spread = "–".join(f"{one:,}" for one in dict.fromkeys((*steps[:1], *steps[-1:])))
     pairs: dict[str, object] = {
         "id": view.id,
         "received": view.received,
         "key": submission.submitter.key,
         "family, knowledge": f"{method.family}, {method.knowledge}",
         "code": submission.code or "none",
-        "runs": f"{len(runs):,}, each of {each or 0} steps, {total:,} in total",
+        "runs": f"{len(runs):,}, each of {spread or 0} steps, {total:,} in total",
         "training": submission.training.library or "not stated",
         "statement": submission.statement or "none",
     }
@@ -288,8 +288,8 @@ def _print_submission(view: PublicView) -> None:
         pairs["failed attempts"] = f"{view.faults}, no verdict; the last: {view.fault}"
     if view.not_ranked not in ("", "reference"):
         pairs["not ranked"] = REASONS.get(view.not_ranked, view.not_ranked)
-    for id, count in view.copy_of:
-        pairs[f"{count} of {len(runs)} runs act like"] = id
+    for each in view.copy_of:
+        pairs[f"{each.runs} of {len(runs)} runs act like"] = each.id
     if view.withdrawal is not None:
         pairs["reason for withdrawal"] = view.withdrawal.content.reason or "not stated"
     title = f"{method.name} {method.version}", submission.submitter.name, view.status

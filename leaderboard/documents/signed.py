@@ -259,9 +259,9 @@ class Signed(Seal, Generic[Kind]):
     @model_serializer(mode="wrap")
     def _content_first(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         plain: dict[str, Any] = handler(self)
-        receiver = {name: plain[name] for name in Receiver._fields if plain[name] is not None}
-        content = {self.content.FIELD: plain["content"]}
-        return {**content, "signature": plain["signature"], **receiver}
+        content = {self.content.FIELD: plain.pop("content")}
+        unnamed = {name for name in Receiver._fields if plain[name] is None}
+        return content | {name: value for name, value in plain.items() if name not in unnamed}
 
     @classmethod
     def _kind(cls) -> type[Signable]:

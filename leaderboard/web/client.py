@@ -22,12 +22,14 @@ import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
+
+from pydantic import Field
 
 from leaderboard.admission import upload_header
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
-from leaderboard.documents.result import EntryRow, Result
+from leaderboard.documents.result import EntryRow, Result, Status
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.errors import CODES, BoardError, NotPublishable, Rejection
@@ -47,6 +49,7 @@ from leaderboard.store.log import (
 from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
 from sme_registry.io import parse_json, server_address, sha256_of
 from sme_registry.seasons.wire import Connection
+from sme_registry.spec.document import Digest, Integer, StrictModel
 
 __all__ = ["Fetched", "board_document", "fetch", "page_of", "status", "submit", "withdraw"]
 
@@ -395,62 +398,41 @@ class _Copy:
         return BoardError(f"{self._served.url}: {message}. Nothing of it was written.")
 
 
-_TEXTS = ("id", "status", "received", "withheld", "not_ranked", "fault")
-_NUMBERS = ("place", "queue", "faults")
+class PublicCopy(StrictModel):
+    """An earlier submission of another key, and how many runs act like its own."""
+
+    id: Digest
+    runs: Integer
 
 
-@dataclass(frozen=True)
-class PublicView:
-    """What the board publishes about one submission."""
+class PublicView(Signed[Submission]):
+    """What the board publishes about one submission: as it was signed, and what became of it."""
 
-    id: str
-    status: str
+    status: Status
     received: str
-    signed: Signed[Submission]
     result: Result | None  # None before scoring, and while its scores are withheld
     withheld: str  # why the scores are withheld; empty if they are not
     withdrawal: Signed[Withdrawal] | None
-    not_ranked: str = ""  # by any metric, a key of `ranking.REASONS`; empty without scores
-    copy_of: tuple[tuple[str, int], ...] = ()  # of other keys: ids, and the number of runs alike
-    place: int = 0  # in the queue, from 1; 0 if it does not wait
-    queue: int = 0  # how many wait, if it does
-    faults: int = 0  # of the board's machine, which ended its scoring while it waits
-    fault: str = ""  # the last of them
+    not_ranked: str  # by any metric, a key of `ranking.REASONS`; empty without scores
+    copy_of: Annotated[tuple[PublicCopy, ...], Field(strict=False)]
+    place: Integer  # in the queue, from 1; 0 if it does not wait
+    queue: Integer  # how many wait, if it does
+    faults: Integer  # of the board's machine, which ended its scoring while it waits
+    fault: str  # the last of them
 
     @classmethod
-    def from_dict(cls, plain: dict[str, Any]) -> PublicView:
-        """The view that `to_dict` wrote, here or in an earlier version of a served board."""
-        try:
-            result, withdrawal = plain["result"], plain["withdrawal"]
-            signed = {name: plain[name] for name in ("submission", "signature")}
-            signed |= {name: plain.get(name) for name in Receiver._fields}  # absent in older ones
-            values: dict[str, Any] = {name: str(plain.get(name, "")) for name in _TEXTS}
-            values |= {name: int(plain.get(name, 0)) for name in _NUMBERS}
-            view = cls(
-                **values,
-                signed=Signed[Submission].from_dict(signed),
-                result=None if result is None else Result.from_dict(result),
-                withdrawal=None if withdrawal is None else Signed[Withdrawal].from_dict(withdrawal),
-                copy_of=tuple((str(x["id"]), int(x["runs"])) for x in plain.get("copy_of", ())),
-            )
-        except SpecError:
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise SpecError(f"submission: invalid answer: {error!r:.200}. Check the URL.") from None
-        if view.signed.id != view.id:
-            raise SpecError(
-                f"id={view.id!r:.80}: the submission has another digest. Check the URL."
-            )
+    def from_dict(cls, data: Any, source: str = "submission") -> Self:
+        """The view that `to_dict` wrote."""
+        fields = dict(data)
+        id = fields.pop("id", None)
+        view = super().from_dict(fields, source)
+        if view.id != id:
+            raise SpecError(f"id={id!r:.80}: the submission has another digest. Check the URL.")
         return view
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            **{name: getattr(self, name) for name in (*_TEXTS, *_NUMBERS)},
-            **self.signed.to_dict(),
-            "result": self.result and self.result.to_dict(),
-            "withdrawal": self.withdrawal and self.withdrawal.to_dict(),
-            "copy_of": [{"id": id, "runs": runs} for id, runs in self.copy_of],
-        }
+        """Every field, and the id."""
+        return {"id": self.id, **super().to_dict()}
 
 
 def public_view(store: Store, entry: EntryRow) -> PublicView:
@@ -466,15 +448,16 @@ def public_view(store: Store, entry: EntryRow) -> PublicView:
         except NotPublishable as error:
             result, withheld = None, str(error)
     return PublicView(
-        id=entry.id,
+        **dict(store.submission(entry.id)),
         status=entry.status,
         received=entry.received,
-        signed=store.submission(entry.id),
         result=result,
         withheld=withheld,
         withdrawal=store.withdrawal(entry.id),
         not_ranked=reason,
-        copy_of=() if withheld else tuple((each.id, each.runs) for each in entry.copy_of),
+        copy_of=tuple(
+            PublicCopy(id=each.id, runs=each.runs) for each in entry.copy_of if not withheld
+        ),
         place=queue.get(entry.id, 0),
         queue=len(queue) if entry.id in queue else 0,
         faults=entry.faults,

@@ -81,8 +81,5 @@ def test_an_earlier_version_is_shown_with_the_reason_why_it_has_no_rank(tmp_path
     assert PublicView.from_dict(views[0].to_dict()) == views[0]
     plain = views[1].to_dict()
     for change in ({"copy_of": [{"id": "x"}]}, {"copy_of": 3}, {"faults": "many"}):
-        with pytest.raises(SpecError, match="invalid answer"):
+        with pytest.raises(SpecError, match=f"{next(iter(change))}.*: "):
             PublicView.from_dict({**plain, **change})
-    for name in ("not_ranked", "copy_of", "place", "faults", "fault"):
-        del plain[name]  # which earlier servers leave out
-    assert PublicView.from_dict(plain) == views[1]
