@@ -50,7 +50,7 @@ from leaderboard.seasons.season import (
     rows_of,
 )
 from leaderboard.seasons.store import SealedRow, SeasonRow, SeasonStore
-from leaderboard.seasons.tickets import Ticket, deadline, score_ticket
+from leaderboard.seasons.tickets import Ticket, deadline
 from leaderboard.store import Store
 from leaderboard.web.client import Files
 from sme_registry.datasets import DatasetRecipe, SealedDataset
@@ -377,7 +377,7 @@ class _SeasonVerifier:
             ticket = Ticket(self.store, self.season, master, row)
             if not ticket.is_ended:
                 self.refuse_early(row, "without the entrant's end")
-            yield score_ticket(self.store, self.season, ticket)
+            yield ticket.score()
 
     def contradiction(self, result: SealedResult) -> Difference | None:
         """The first value of a result that does not follow from the regrets of its runs."""

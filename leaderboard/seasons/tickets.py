@@ -58,8 +58,7 @@ class Ticket:
 
     def __init__(self, store: SeasonStore, season: Season, master: Master, row: SealedRow) -> None:
         self.number, self.id = row.number, row.id
-        self._season, self._master = season, master
-        self._clock, self._queue = store.clock, store.queue
+        self._store, self._season, self._master = store, season, master
         self._request = request = store.request_of(row)
         place = Place(season.id, "", 0, str(row.number), request.content.nonce)
         self._token = master.secret("token", place).hex()
@@ -109,7 +108,7 @@ class Ticket:
 
     def check_running(self) -> None:
         """Raise `Rejection` (`ticket_ended`) if the ticket is over, or older than transcripts."""
-        is_over = self._closed or self._clock.received() >= self.deadline
+        is_over = self._closed or self._store.clock.received() >= self.deadline
         if is_over or self._request.content.transcript is None:
             raise Rejection(
                 "ticket_ended",
@@ -151,14 +150,11 @@ class Ticket:
 
     @property
     def status(self) -> TicketStatus:
-        places = self._queue.places()
         return TicketStatus(
             ticket=self.number,
-            phase="ended" if self.is_over(self._clock.time) else "running",
+            phase="ended" if self.is_over(self._store.clock.time) else "running",
             deadline=self.deadline,
             instances=tuple(each.status for each in self.instances),
-            place=places.get(self.id, 0),
-            queue=len(places) if self.id in places else 0,
         )
 
     def instance(self, number: int) -> Instance:
@@ -179,27 +175,25 @@ class Ticket:
         for each in self.instances:
             each.release()
 
+    def score(self) -> SealedResult:
+        """Its result when it is over, from its journals and answers."""
+        runs, stepping = [], []
+        versions: dict[str, str] = {}
+        board, season = self._store.document, self._season
+        for number, instance in enumerate(self.instances):
+            [(run, used)] = score_runs(self.hidden(number), [instance.answers], board.rules)
+            versions |= used
+            runs.append(run)
+            stepping.append(instance.stepping())
+        result = sealed_result(season, self.id, runs, versions, board.draws, stepping, board.rules)
+        return result.model_copy(update={"signed": self.signed_end.digest})
 
-def score_ticket(store: SeasonStore, season: Season, ticket: Ticket) -> SealedResult:
-    """Score a ticket that is over, from its journals and answers."""
-    runs, stepping = [], []
-    versions: dict[str, str] = {}
-    draws, rules = store.document.draws, store.document.rules
-    for number, instance in enumerate(ticket.instances):
-        [(run, used)] = score_runs(ticket.hidden(number), [instance.answers], rules)
-        versions |= used
-        runs.append(run)
-        stepping.append(instance.stepping())
-    result = sealed_result(season, ticket.id, runs, versions, draws, stepping, rules)
-    return result.model_copy(update={"signed": ticket.signed_end.digest})
-
-
-def finish_ticket(store: SeasonStore, season: Season, ticket: Ticket) -> None:
-    """Score a ticket that is over, and log its result."""
-    not_before = "" if ticket.is_ended else ticket.deadline
-    store.finish(score_ticket(store, season, ticket), not_before)
-    for each in ticket.instances:
-        each.forget()
+    def finish(self) -> None:
+        """Score it, and log its result."""
+        not_before = "" if self.is_ended else self.deadline
+        self._store.finish(self.score(), not_before)
+        for each in self.instances:
+            each.forget()
 
 
 MOST_HELD_LANES, _FIXED_LANES, _WEIGHTS_OF_A_LANE = 2**17, 128, 100
@@ -359,7 +353,7 @@ class ScoreTicket:
         season = store.season(row.track)
         masters = map(Master.read, self.secrets)
         master = next(each for each in masters if season.is_committed_to(each))
-        finish_ticket(store, season, Ticket(store, season, master, row))
+        Ticket(store, season, master, row).finish()
 
 
 def refuse_other_sender(

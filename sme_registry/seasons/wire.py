@@ -221,8 +221,6 @@ class TicketStatus(StrictModel):
     phase: Literal["running", "ended"]  # ended: every instance is answered, or the deadline over
     deadline: Annotated[str, Field(max_length=40)]  # until when answers count, in UTC
     instances: TupleOf[InstanceStatus]  # in the ticket's order
-    place: Count = 0  # in the queue to be scored, from 1, of `queue`; 0 if it does not wait
-    queue: Count = 0
 
 
 def tickets_path(season: str) -> str:

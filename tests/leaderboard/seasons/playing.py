@@ -15,7 +15,7 @@ from leaderboard.errors import Rejection
 from leaderboard.seasons.entrant import request_ticket, signer_of
 from leaderboard.seasons.season import Season, TicketRequest
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.tickets import Sessions, Ticket, score_ticket, start_ticket
+from leaderboard.seasons.tickets import Sessions, Ticket, start_ticket
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import (
     Chain,
@@ -188,8 +188,7 @@ class Played:
 
 def scored(store, season, number):
     """The result of a ticket."""
-    ticket = Ticket(store, season, MASTER, store.ticket(season.digest, number))
-    return score_ticket(store, season, ticket)
+    return Ticket(store, season, MASTER, store.ticket(season.digest, number)).score()
 
 
 def request(number, value=0.3, lanes=LANES):
