@@ -242,19 +242,16 @@ def answer(
                 if not isinstance(prepared, np.ndarray):
                     prepared = actions_in(hidden.challenge(), prepared, hidden.setting)
                 hidden.send_answers(prepared)
-            phases[number] = "answered"
             progress.update(done)
-    left = sum(phase != "answered" for phase in phases)
-    if left:
-        out().print(f"{plural(left, 'instance')} without answers")
-        return
     with Instance(url, held) as first:
-        has_ended = first.end_ticket()
-    out().print(
-        "The ticket has ended."
-        if has_ended
-        else f"The ticket ends at {escape(held.deadline)}: some instances were answered elsewhere."
-    )
+        left = sum(each.phase != "answered" for each in first.status().instances)
+        if left:
+            text = f"{plural(left, 'instance')} without answers"
+        elif first.end_ticket():
+            text = "The ticket has ended."
+        else:
+            text = f"The ticket ends at {held.deadline}: some instances were answered elsewhere."
+    out().print(escape(text))
 
 
 def _prepared(

@@ -15,9 +15,9 @@ import contextlib
 import io as streams
 import threading
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ import numpy.typing as npt
 from leaderboard.documents.signed import Signable, Signed, verifies
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.seasons.journal import Journal, Play, no_steps
-from leaderboard.seasons.scoring import Answered, HiddenTask
+from leaderboard.seasons.scoring import Answered
 from leaderboard.seasons.season import (
     MAX_LANES,
     Answers,
@@ -36,12 +36,15 @@ from leaderboard.seasons.season import (
     read_answers,
     rows_of,
 )
-from sme_registry import EvaluationProtocol, io
+from sme_registry import io
 from sme_registry.errors import ActionError, SMEError, WireError
 from sme_registry.io import read_regular
 from sme_registry.seasons.transcript import EVERY, Chain, answers_head, challenge_head
 from sme_registry.seasons.wire import InstanceStatus, table_bytes
 from sme_registry.spec.document import Document
+
+if TYPE_CHECKING:
+    from leaderboard.seasons.tickets import Ticket
 
 SignedHead = Signed[InstanceHead]
 _Kind = TypeVar("_Kind", bound=Signable)
@@ -102,31 +105,18 @@ class SignedFile(Generic[_Kind]):
 
 
 class Instance:
-    """One hidden instance, for any number of threads.
+    """One hidden instance of a ticket, for any number of threads."""
 
-    `hidden` derives the task; `check_running` rejects what comes after the ticket's end.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        chain: Chain,
-        request: Signed[TicketRequest],
-        member: SeasonClass,
-        protocol: EvaluationProtocol,
-        hidden: Callable[[], HiddenTask],
-        check_running: Callable[[], None],
-    ) -> None:
-        self._chain, self._request = chain, request
-        self._is_old = request.content.transcript is None
-        self._member, self._protocol = member, protocol
+    def __init__(self, ticket: Ticket, number: int, member: SeasonClass) -> None:
+        self._ticket, self._number, self._setting = ticket, number, member.setting
+        self._chain = Chain(request=ticket.id, ticket=ticket.number, instance=number)
+        self._is_old = ticket.request.content.transcript is None
         assert member.budget is not None  # the track is online
         self.budget = member.budget
-        self._hidden, self._check_running = hidden, check_running
-        name = folder / str(chain.instance)
+        name = ticket.folder / str(number)
         self._journal_path = name.with_suffix(".journal")
         self._answers_path = name.with_suffix(".npy")
-        self._signature = SignedFile(name.with_suffix(".json"), SignedHead, request)
+        self._signature = SignedFile(name.with_suffix(".json"), SignedHead, ticket.request)
         self._snapshot_path = name.with_suffix(".npz")
         self._challenge_path = name.with_suffix(".challenge")
         self._lock = threading.RLock()
@@ -182,16 +172,16 @@ class Instance:
             return None, None
         with storage():
             data = read_regular(self._answers_path, self.answer_bytes)
-        return read_answers(data, self._member.setting, self._protocol), io.sha256_of(data)
+        return read_answers(data, self._setting, self._ticket.season.protocol), io.sha256_of(data)
 
     @property
     def answer_bytes(self) -> int:
-        return table_bytes(rows_of(self._protocol), self._member.setting.action_dim)
+        return table_bytes(rows_of(self._ticket.season.protocol), self._setting.action_dim)
 
     @property
     def weights(self) -> int:
         """The number of weights of the task's network, without biases."""
-        setting = self._member.setting
+        setting = self._setting
         S, A, H = setting.state_dim, setting.action_dim, setting.hidden_width
         return H * (S + (setting.complexity - 2) * H + A)
 
@@ -209,7 +199,7 @@ class Instance:
     def start(self, lanes: int) -> bytes:
         """Begin, or go on after a lost connection; the present observations."""
         with self._lock:
-            self._check_running()
+            self._ticket.check_running()
             journal = self.journal
             if journal is None:
                 most = min(MAX_LANES, self.budget)
@@ -218,7 +208,7 @@ class Instance:
                         "lanes_invalid", f"lanes={lanes}: must be in [1, {most}]. Correct it."
                     )
                 with storage():
-                    action_dim = self._member.setting.action_dim
+                    action_dim = self._setting.action_dim
                     journal = Journal.create(self._journal_path, lanes, action_dim)
                 self._journal = journal
             if lanes != journal.lanes:
@@ -229,7 +219,7 @@ class Instance:
     def step(self, body: bytes, signature: str = "") -> bytes:
         """Take the steps of a request, signed where due, or answer the last one again."""
         with self._lock:
-            self._check_running()
+            self._ticket.check_running()
             play = self._playing()
             try:
                 number = play.unpack(body)
@@ -251,7 +241,7 @@ class Instance:
 
     def finish(self, signature: str) -> None:
         with self._lock:
-            self._check_running()
+            self._ticket.check_running()
             journal = self._started()
             if not journal.ended:
                 self._sign(self._playing(), signature)
@@ -265,7 +255,7 @@ class Instance:
                 raise _wrong_phase(self.status.phase, "Finish it before the challenge.")
             with storage():
                 if not self._challenge_path.exists():
-                    write_whole(self._challenge_path, self._hidden().challenge)
+                    write_whole(self._challenge_path, self._ticket.hidden(self._number).challenge)
                 return read_regular(self._challenge_path, 2**28)
 
     def answer(self, data: bytes, signature: str) -> bool:
@@ -274,9 +264,9 @@ class Instance:
             if self.answered and read_regular(self._answers_path, len(data) + 1) == data:
                 io.sync_folder(self._answers_path.parent)  # which may have failed the first time
                 return False
-            self._check_running()
+            self._ticket.check_running()
             states = self.challenge()
-            read_answers(data, self._member.setting, self._protocol)
+            read_answers(data, self._setting, self._ticket.season.protocol)
             if self.answered:
                 raise Rejection(
                     "answer_conflict",
@@ -323,18 +313,20 @@ class Instance:
         else:
             head, number = play.head, signed.content.hashes
             if number > journal.requests:
-                head = answers_head(challenge_head(head, self._hidden().challenge), answers)
+                head = answers_head(
+                    challenge_head(head, self._ticket.hidden(self._number).challenge), answers
+                )
             is_right = self._signature.is_of(self._chain.at(number, head))
         if not is_right:
             raise self._signature.tampered("this transcript")
 
     def _has_stated(self, journal: Journal, answers: bytes) -> bool:
         """Whether the entrant has signed answers and journal, before there were transcripts."""
-        if self._request.content.answers_key is None:
+        if self._ticket.request.content.answers_key is None:
             return True
         digests = io.sha256_of(answers), io.sha256_of(b"".join(journal.bodies()))
         statement = Answers(**dict(self._chain), answers=digests[0], journal=digests[1])
-        file = SignedFile(self._signature.path, Signed[Answers], self._request)
+        file = SignedFile(self._signature.path, Signed[Answers], self._ticket.request)
         return file.is_of(statement)
 
     def sync(self) -> None:
@@ -357,7 +349,7 @@ class Instance:
             self._play = None
 
     def _new_play(self, lanes: int) -> Play:
-        hidden = self._hidden()
+        hidden = self._ticket.hidden(self._number)
         return Play(hidden.spec, hidden.starts, self._chain, lanes, self.budget)
 
     def _playing(self) -> Play:

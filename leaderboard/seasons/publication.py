@@ -164,8 +164,8 @@ def files_of_seasons(store: Store) -> Iterator[Files]:
 
 def check_published(
     season: Season, folder: str | os.PathLike[str], progress: Progress | None = None
-) -> int:
-    """Check data sets and challenge states against their digests; returns their number."""
+) -> None:
+    """Check data sets and challenge states against their digests."""
     folder = Path(folder)
     for done, (hidden, digests) in enumerate(
         zip(season.hidden, season.published, strict=False), start=1
@@ -192,7 +192,6 @@ def check_published(
         _refuse_other_digest(path, sha256_of(states), digests.challenge)
         if progress is not None:
             progress(done, len(season.published))
-    return len(season.published)
 
 
 def _refuse_other_digest(path: Path, found: str, expected: str) -> None:
@@ -303,7 +302,8 @@ class _SeasonVerifier:
         if folder is None:
             self.report("data sets", 0, count, "not in this folder" * bool(count))
             return
-        self.report("data sets, by their digests", check_published(self.season, folder))
+        check_published(self.season, folder)
+        self.report("data sets, by their digests", count)
 
     def generate_again(self, master: Master) -> None:
         """Compare what was published with what the master gives."""

@@ -17,7 +17,6 @@ from collections import OrderedDict
 from collections.abc import Collection
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from leaderboard.admission import check_entrant, check_manifest, uploader
@@ -42,7 +41,6 @@ from leaderboard.seasons.store import SealedRow, SeasonStore
 from leaderboard.store import Store
 from sme_registry import seasons
 from sme_registry.io import file_lock
-from sme_registry.seasons.transcript import Chain
 from sme_registry.seasons.wire import StepFormat, TicketStatus
 
 
@@ -58,38 +56,29 @@ class Ticket:
 
     def __init__(self, store: SeasonStore, season: Season, master: Master, row: SealedRow) -> None:
         self.number, self.id = row.number, row.id
-        self._store, self._season, self._master = store, season, master
-        self._request = request = store.request_of(row)
-        place = Place(season.id, "", 0, str(row.number), request.content.nonce)
+        self._store, self.season, self._master = store, season, master
+        self.request = store.request_of(row)
+        place = Place(season.id, "", 0, str(row.number), self.request.content.nonce)
         self._token = master.secret("token", place).hex()
         self.deadline = deadline(season, row)
         self._closed = row.result is not None
-        folder = store.ticket_folder(row.track, row.number)
-        self.signed_end = SignedFile(folder / "end.json", Signed[AllHeads], request)
+        self.folder = store.ticket_folder(row.track, row.number)
+        self.signed_end = SignedFile(self.folder / "end.json", Signed[AllHeads], self.request)
         self._hidden = tuple(season.hidden)
         self.instances = tuple(
-            Instance(
-                folder,
-                Chain(request=self.id, ticket=self.number, instance=number),
-                request,
-                hidden.member,
-                season.protocol,
-                partial(self.hidden, number),
-                self.check_running,
-            )
-            for number, hidden in enumerate(self._hidden)
+            Instance(self, number, hidden.member) for number, hidden in enumerate(self._hidden)
         )
 
     @property
     def document(self) -> seasons.Ticket:
         return seasons.Ticket.from_dict(
             {
-                "season": self._season.id,
+                "season": self.season.id,
                 "ticket": self.number,
                 "token": self._token,
                 "deadline": self.deadline,
                 "lanes": MAX_LANES,
-                "classes": [member.model_dump(exclude={"data"}) for member in self._season.classes],
+                "classes": [member.model_dump(exclude={"data"}) for member in self.season.classes],
             }
         )
 
@@ -109,7 +98,7 @@ class Ticket:
     def check_running(self) -> None:
         """Raise `Rejection` (`ticket_ended`) if the ticket is over, or older than transcripts."""
         is_over = self._closed or self._store.clock.received() >= self.deadline
-        if is_over or self._request.content.transcript is None:
+        if is_over or self.request.content.transcript is None:
             raise Rejection(
                 "ticket_ended",
                 f"ticket={self.number}: has ended, at the latest at {self.deadline}. What it "
@@ -140,7 +129,7 @@ class Ticket:
     def is_ended(self) -> bool:
         """Whether the entrant has signed its end; or answered all of it, before transcripts."""
         is_answered = all(each.answered for each in self.instances)
-        if self._request.content.transcript is None:
+        if self.request.content.transcript is None:
             return is_answered
         if not self.signed_end.path.exists():
             return False
@@ -166,8 +155,8 @@ class Ticket:
         return self.instances[number]
 
     def hidden(self, number: int) -> HiddenTask:
-        nonce, hidden = self._request.content.nonce, self._hidden[number]
-        return HiddenTask.of(self._season, self._master, hidden, str(self.number), nonce)
+        nonce, hidden = self.request.content.nonce, self._hidden[number]
+        return HiddenTask.of(self.season, self._master, hidden, str(self.number), nonce)
 
     def close(self) -> None:
         """End the ticket: wait for the requests in progress, and refuse all others."""
@@ -179,7 +168,7 @@ class Ticket:
         """Its result when it is over, from its journals and answers."""
         runs, stepping = [], []
         versions: dict[str, str] = {}
-        board, season = self._store.document, self._season
+        board, season = self._store.document, self.season
         for number, instance in enumerate(self.instances):
             [(run, used)] = score_runs(self.hidden(number), [instance.answers], board.rules)
             versions |= used

@@ -30,7 +30,6 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from leaderboard.documents.result import Metric
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.errors import Rejection
 from leaderboard.scoring.ranking import REASONS
@@ -135,12 +134,6 @@ def _stepped(store: SeasonStore, row: SealedRow) -> tuple[float | None, list[flo
     return float(regret), np.mean(values, axis=0).tolist()
 
 
-@functools.lru_cache(16)
-def _ranking(store: SeasonStore, season: str, metric: Metric, head: str) -> dict[str, Any]:
-    """The ranking of a season when the log had this head."""
-    return {**ranking_facts(store, store.season(season), metric)}
-
-
 class SeasonRoutes:
     """The handlers of a server, which steps the seasons whose masters are in `secrets`."""
 
@@ -218,7 +211,7 @@ class SeasonRoutes:
 
         def ranked() -> bytes:
             row = self._store.season_row(name)
-            facts = _ranking(self._store, row.digest, metric, self._store.head.digest)
+            facts = ranking_facts(self._store, self._store.season(row.digest), metric)
             return to_json({**self._view(row), "metric": metric, "ranking": facts}).encode()
 
         return Response(await _run(ranked, self._rankings), media_type="application/json")

@@ -124,7 +124,7 @@ def false_season(store, terms):
 
 def test_a_season_is_generated_from_its_plan_and_its_master(season, published, tmp_path):
     assert season.is_committed_to(MASTER)
-    assert check_published(season, published) == 2
+    check_published(season, published)
     assert create_season(read_plan(plan()), MASTER, tmp_path / "again") == season
     assert season.versions["numpy"] == np.__version__
     assert {"sme_registry", "python", "scipy"} <= set(season.versions)
