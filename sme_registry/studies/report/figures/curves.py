@@ -320,13 +320,15 @@ def _class_labels(group: Group, *, with_symbol: bool = False) -> list[str]:
 def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
     """The dynamic regret over the lifetime, one panel a stream."""
     regret, references = (analysis.tables[f"stream_{n}"] for n in ("regret", "reference_regret"))
+    if regret.empty:
+        return
     looks = {
         name: {**look, "linestyle": "-"}
         for name, look in looks_of(analysis, regret.algorithm).items()
     }
 
-    def draw_stream(axes: Axes, name: str) -> None:
-        rows = regret[regret.class_name == name]
+    def draw_stream(axes: Axes, rows: pd.DataFrame) -> None:
+        name = rows.class_name.iloc[0]
         for algorithm, look in looks.items():
             curve = rows[rows.algorithm == algorithm]
             for column, (_, beside, _) in _BESIDE.items():
@@ -343,7 +345,7 @@ def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
     drawn = {LABELS[n]: look for n, look in _REFERENCES.items() if n in set(references.reference)}
     named = {**looks, **{label: look for label, look, _ in beside}, **drawn}
     figure = panel_grid(
-        _named(_lived(analysis)), draw_stream, _HEIGHTS, x="lifetime (steps)",
+        panels.by(regret, "class_name"), draw_stream, _HEIGHTS, x="lifetime (steps)",
         y="dynamic regret  (Σ of 1 − r)", looks=named, title_pad=_PAD,
     )  # fmt: skip
     caption = (
@@ -356,23 +358,23 @@ def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
 
 def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
     """The plasticity ratio by visit, one panel a stream."""
-    rows = _within(analysis.tables["stream_visit_metrics"])
-    rows = rows[rows.metric == "plasticity_ratio"]
+    rows = analysis.tables["stream_visit_metrics"]
+    rows = rows[(rows.region == WITHIN) & (rows.metric == "plasticity_ratio")]
     if rows.empty:
         return
     looks = looks_of(analysis, rows.algorithm)
 
-    def draw_stream(axes: Axes, name: str) -> None:
-        for algorithm, look, shift in panels.side_by_side(looks, 0.4):
-            lives = rows[(rows.class_name == name) & (rows.algorithm == algorithm)]
-            panels.marks(axes, lives, "iqm", lives.visit + shift, look, upright=True, joined=True)
+    def draw_stream(axes: Axes, of_stream: pd.DataFrame) -> None:
+        for algorithm, look, shift in side_by_side(looks, 0.4):
+            lives = of_stream[of_stream.algorithm == algorithm]
+            marks(axes, lives, "iqm", lives.visit + shift, look, upright=True, joined=True)
         axes.axhline(1.0, color="black", linewidth=0.9, zorder=1.5)
-        tick_visits(axes, _visits(analysis, name))
+        tick_visits(axes, _visits(analysis, of_stream.class_name.iloc[0]))
 
-    names = [name for name in _lived(analysis) if name in set(rows.class_name)]
     figure = panel_grid(
-        _named(names), draw_stream, _HEIGHTS, x="visit of phase", y="plasticity ratio", looks=looks
-    )
+        panels.by(rows, "class_name"), draw_stream, _HEIGHTS, x="visit of phase",
+        y="plasticity ratio", looks=looks,
+    )  # fmt: skip
     yield Picture(
         "stream-plasticity",
         "Plasticity by visit",
@@ -385,9 +387,8 @@ def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
 
 def draw_retention(analysis: Analysis) -> Iterator[Picture]:
     """The retention matrices of each stream, one panel an algorithm."""
-    for name in _lived(analysis):
-        rows = _within(analysis.tables["stream_matrices"])
-        rows = rows[rows.class_name == name]
+    matrices = analysis.tables["stream_matrices"]
+    for name, rows in panels.by(matrices[matrices.region == WITHIN], "class_name"):
         yield Picture(
             f"stream-retention-{slug(name)}",
             f"Retention in {name}",
@@ -422,13 +423,13 @@ def _retention(rows: pd.DataFrame, visits: Sequence[Visit]) -> Figure:
 
 def draw_performance(analysis: Analysis) -> Iterator[Picture]:
     """Performance on each phase over the visits of each stream, one panel an algorithm."""
-    for name in _lived(analysis):
-        reports: dict[str, list[StreamReport]] = {}
-        for life in analysis.lives:
-            if life.planned.class_name == name:
-                reports.setdefault(life.planned.algorithm, []).append(life.report)
+    reports: dict[str, dict[str, list[StreamReport]]] = {}
+    for life in analysis.lives:
+        of_stream = reports.setdefault(life.planned.class_name, {})
+        of_stream.setdefault(life.planned.algorithm, []).append(life.report)
+    for name, of_stream in reports.items():
         figure = panel_grid(
-            reports.items(), lambda axes, of_agent: performance_curve(of_agent, ax=axes),
+            of_stream.items(), lambda axes, of_agent: performance_curve(of_agent, ax=axes),
             (0.9, 2.4), x="visit of phase", y="performance", share_x=True,
         )  # fmt: skip
         legend_below(figure, figure.axes[0].get_legend_handles_labels()[0])
@@ -447,20 +448,6 @@ def _finish_lifetime(axes: Axes, analysis: Analysis, name: str) -> None:
     panels.tick_steps(axes)
     axes.set_xlim(0.0, visits[-1].lifetime)
     shade_visits(axes, visits)
-
-
-def _within(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows[rows.region == WITHIN]
-
-
-def _named(names: Sequence[str]) -> list[tuple[str, str]]:
-    return [(name, name) for name in names]
-
-
-def _lived(analysis: Analysis) -> list[str]:
-    """The streams with a finished life, in the plan's order."""
-    present = {life.planned.class_name for life in analysis.lives}
-    return [name for name in analysis.streams if name in present]
 
 
 def _visits(analysis: Analysis, name: str) -> Sequence[Visit]:
