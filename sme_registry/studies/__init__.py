@@ -5,7 +5,7 @@
     lives = studies.load_streams("runs/continual").lives  # of agents in streams
     results[results.region == "OOD 5"].groupby("class_name").similarity.median()
 
-Names load on first use: running a study needs no pandas.
+Running a study needs no pandas: what reports load is loaded on first use.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from sme_registry.spec.study import sweep
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import CellStatus as CellStatus
+from sme_registry.studies.ledger import study_status as study_status
+from sme_registry.studies.result import CellResult as CellResult
+from sme_registry.studies.runner import run_study
+
 if TYPE_CHECKING:
-    from sme_registry.spec.study import sweep
-    from sme_registry.studies.cell import run_cell
-    from sme_registry.studies.ledger import CellStatus as CellStatus
-    from sme_registry.studies.ledger import study_status as study_status
     from sme_registry.studies.report.frames import load, load_streams
     from sme_registry.studies.report.write import compare, write_report
-    from sme_registry.studies.result import CellResult as CellResult
-    from sme_registry.studies.runner import run_study
 
 __all__ = [
     "compare",
@@ -33,23 +34,13 @@ __all__ = [
     "write_report",
 ]
 
-_LAZY = {
-    "CellResult": "studies.result",
-    "CellStatus": "studies.ledger",
-    "compare": "studies.report.write",
-    "load": "studies.report.frames",
-    "load_streams": "studies.report.frames",
-    "run_cell": "studies.cell",
-    "run_study": "studies.runner",
-    "study_status": "studies.ledger",
-    "sweep": "spec.study",
-    "write_report": "studies.report.write",
-}
+_LAZY = {"compare": "write", "load": "frames", "load_streams": "frames", "write_report": "write"}
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(importlib.import_module(f"sme_registry.{_LAZY[name]}"), name)
+        module = importlib.import_module(f"sme_registry.studies.report.{_LAZY[name]}")
+        return getattr(module, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
