@@ -246,6 +246,9 @@ def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
     edges = np.linspace(0, len(run.s), min(_TIME_BINS, len(run.s)) + 1).round().astype(int)
     bins = [slice(low, high) for low, high in itertools.pairwise(edges.tolist())]
     visited = np.sort(run.s[run.alive], axis=0)
+    ranks = np.arange(len(visited) + 1)[:, None] / len(visited)
+    shift = np.maximum((ranks[1:] - visited).max(axis=0), (visited - ranks[:-1]).max(axis=0))
+    counts = (np.histogram(values, _COVERAGE_BINS, (0.0, 1.0))[0] for values in visited.T)
     return OnPolicy(
         episodes=len(run.terminated),
         scores={name: trajectories.score for name, trajectories in runs.items()},
@@ -259,8 +262,8 @@ def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
         random_signal=_reward_signal(task, random),
         credit=_credit(run),
         random_credit=_credit(random),
-        state_shift=tuple(_distance_from_uniform(values) for values in visited.T),
-        coverage=min(_coverage(values) for values in visited.T),
+        state_shift=tuple(shift.tolist()),
+        coverage=min(float((count > 0).mean()) for count in counts),
     )
 
 
@@ -288,18 +291,6 @@ def _credit(run: Trajectories) -> float | None:
     if len(reward) < 2 or reward.std() < 1e-9 or payout.std() < 1e-9:
         return None
     return float(np.corrcoef(reward, payout)[0, 1] ** 2)
-
-
-def _distance_from_uniform(values: Array) -> float:
-    """Kolmogorov-Smirnov distance of sorted values from the uniform distribution."""
-    n = len(values)
-    ranks = np.arange(n + 1) / n
-    return float(max((ranks[1:] - values).max(), (values - ranks[:-1]).max()))
-
-
-def _coverage(values: Array) -> float:
-    counts, _ = np.histogram(values, _COVERAGE_BINS, (0.0, 1.0))
-    return float((counts > 0).mean())
 
 
 def training(log: Log, constant_regret: float) -> TrainingSummary:

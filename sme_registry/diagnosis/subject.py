@@ -141,7 +141,12 @@ def load_run(folder: str | Path) -> AnySubject:
     if record.stream is not None:
         kept = run_files.Snapshots(folder / run_files.SNAPSHOTS, record.stream)
         networks = networks_of(kept, record.stream, record.action_range)
-        report, models = _report_of_life(folder), tuple(kept.visits)
+        if not (folder / STREAM).exists():
+            raise OptionError(
+                f"run={str(folder)!r}: contains no {STREAM} yet. A life in a stream is diagnosed "
+                "when it has ended. Continue it with `sme train … --resume`."
+            )
+        report, models = StreamReport.read(folder / STREAM), tuple(kept.visits)
         return StreamSubject(name, report, plan, *networks, None, updates, models)
     path, checkpoint_step = _model_of_run(folder, record)
     log = folder / run_files.EPISODES
@@ -204,15 +209,6 @@ def _model_of_run(folder: Path, record: RunRecord) -> tuple[Path, int | None]:
         f"run={str(folder)!r}: has neither {record.model_name} nor a {CHECKPOINT} that can be "
         "diagnosed. Wait for it, or continue the run with `sme train … --resume`."
     )
-
-
-def _report_of_life(folder: Path) -> StreamReport:
-    if not (folder / STREAM).exists():
-        raise OptionError(
-            f"run={str(folder)!r}: contains no {STREAM} yet. A life in a stream is diagnosed when "
-            "it has ended. Continue it with `sme train … --resume`."
-        )
-    return StreamReport.read(folder / STREAM)
 
 
 def _log_of_episodes(path: Path) -> Log | None:
