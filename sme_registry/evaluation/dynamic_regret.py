@@ -28,8 +28,8 @@ from sme_registry.evaluation import retention
 from sme_registry.evaluation.evaluate import same_draw
 from sme_registry.evaluation.policies import Policy, check_count, stream_policy
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.evaluation.rollouts import rollouts, start_states
-from sme_registry.io import integer_in
+from sme_registry.evaluation.rollouts import numbers_in, rollouts, start_states
+from sme_registry.io import integer_in, number_in
 from sme_registry.spec import StreamSpec
 from sme_registry.spec.catalogue import resolve
 from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
@@ -80,9 +80,8 @@ class DynamicRegret(StrictModel):
     def with_fresh(self, stream: StreamSpec, online_regret: Sequence[float]) -> Self:
         """This regret with the learning transfer of its visits, against fresh agents' `[P]`."""
         self._check_stream(stream)
-        name = "fresh online_regret"
-        fresh = _column(name, online_regret, len(stream.phases), "phase")
-        _check_regrets(f"{name}={fresh.tolist()}", fresh)
+        P = len(stream.phases)
+        fresh = numbers_in("fresh online_regret", online_regret, P, 0.0, 1.0, of="phase")
         online = np.array([visit.online_regret for visit in self.visits], dtype=np.float64)
         online[~self._are_over(stream)] = np.nan
         transfer = retention.learning_transfer(online, fresh)
@@ -184,13 +183,12 @@ def _visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
 
 def _visits_in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:
     """`[N]` visits in force: the latest one of each row's phase that has begun."""
-    phases = _column("phase", phase, len(visits)).astype(np.int64)
     P = len(stream.phases)
-    in_force = visits - (visits - phases) % P
-    if (phases < 0).any() or (phases >= P).any() or (in_force < 0).any():
+    phases = numbers_in("phase", phase, len(visits), 0, P - 1, of="row", whole=True)
+    in_force = visits - (visits - phases.astype(np.int64)) % P
+    if (in_force < 0).any():
         raise OptionError(
-            f"phase: must be the index of a phase that has begun, in [0, {P - 1}]. Give "
-            "info['phase'] of each step."
+            "phase: must be the index of a phase that has begun. Give info['phase'] of each step."
         )
     return np.asarray(in_force)
 
@@ -217,38 +215,17 @@ def _rows(
     count = np.size(step)
     if count == 0:
         raise OptionError("step: has no rows. Give one or more finished episodes or steps.")
-    ends, lengths, means = (
-        _column(name, values, count)
-        for name, values in (("step", step), ("length", length), ("regret", regret))
+    ends, lengths = (
+        numbers_in(name, values, count, 1, 2**53, of="row", whole=True).astype(np.int64)
+        for name, values in (("step", step), ("length", length))
     )
-    _check_regrets("regret", means)
     begins = ends - lengths
-    if (lengths < 1).any() or begins[0] < 0 or (begins[1:] < ends[:-1]).any():
+    if begins[0] < 0 or (begins[1:] < ends[:-1]).any():
         raise OptionError(
-            "step, length: rows must have a length of at least 1 and must not overlap. Give the "
-            "rows of one life in order; of parallel environments, each lives a life of its own."
+            "step, length: rows must not overlap. Give the rows of one life in order; of parallel "
+            "environments, each lives a life of its own."
         )
-    return ends.astype(np.int64), lengths.astype(np.int64), means
-
-
-def _column(name: str, values: npt.ArrayLike, count: int, of: str = "row") -> Array:
-    """`[count]` finite numbers, one for each of what `of` says; or, of rows, one for all."""
-    try:
-        array = np.asarray(values, dtype=np.float64)
-        if array.shape != (count,) and not (of == "row" and array.shape == ()):
-            raise ValueError
-    except (TypeError, ValueError):
-        raise OptionError(
-            f"{name}={values!r:.60}: must be {count} numbers, one for each {of}."
-        ) from None
-    if not np.isfinite(array).all():
-        raise OptionError(f"{name}: has NaN or infinite entries. Give finite numbers.")
-    return np.broadcast_to(array, (count,))
-
-
-def _check_regrets(name: str, values: Array) -> None:
-    if ((values < 0.0) | (values > 1.0)).any():
-        raise OptionError(f"{name}: must be in [0, 1]. Give means of 1 − r.")
+    return ends, lengths, numbers_in("regret", regret, count, 0.0, 1.0, of="row")
 
 
 class RegretBlocks:
@@ -358,8 +335,7 @@ def _policies(
     for v, entry in enumerate(life):
         where = f"life[{v}]"
         if isinstance(entry, RealNumber | np.bool_):
-            if isinstance(entry, bool | np.bool_) or not 0.0 <= float(entry) <= 1.0:
-                raise OptionError(f"{where}={entry}: must be a policy, or a regret in [0, 1].")
+            number_in(where, entry, 0.0, 1.0)
         elif id(entry) not in policies:
             policies[id(entry)] = stream_policy(entry, stream, where, action_range)
     return policies

@@ -227,8 +227,8 @@ def values(
         )
     s = _states(states, spec.state_dim)
     B = len(s)
-    steps = _each("t", t, B, 0, spec.horizon - 1, whole=True).astype(np.int64)
-    r_cum = _each("accumulated", accumulated, B, 0.0, spec.k)
+    steps = numbers_in("t", t, B, 0, spec.horizon - 1, of="state", whole=True).astype(np.int64)
+    r_cum = numbers_in("accumulated", accumulated, B, 0.0, spec.k, of="state")
     d = _rows("distractors", distractors, (B, spec.distractors))
     first = _rows("actions", actions, (B, spec.action_dim))
     if policy == "optimal" and first is None and horizon == "finite" and _has_formula(spec, gamma):
@@ -311,19 +311,26 @@ class _AtEnd:
         return getattr(self._policy, "bonus", 0.0)
 
 
-def _each(
-    name: str, given: npt.ArrayLike, B: int, low: float, high: float, *, whole: bool = False
+def numbers_in(
+    name: str,
+    given: npt.ArrayLike,
+    count: int,
+    low: float,
+    high: float,
+    *,
+    of: str,
+    whole: bool = False,
 ) -> Array:
-    """A number for each state, from one or from `[B]`."""
+    """`[count]` numbers in a range, one for each of what `of` says, from so many or from one."""
     numbers = _numbers(given)
     allowed = (low <= numbers) & (numbers <= high) & (not whole or numbers == np.rint(numbers))
-    if numbers.shape not in ((), (B,)) or not allowed.all():
+    if numbers.shape not in ((), (count,)) or not allowed.all():
         kind = "integer" if whole else "number"
         raise OptionError(
-            f"{name}={given!r:.80}: must be one {kind} or {B}, one for each state, in "
+            f"{name}={given!r:.80}: must be one {kind} or {count}, one for each {of}, in "
             f"[{low:g}, {high:g}]."
         )
-    return np.broadcast_to(numbers, (B,)).copy()
+    return np.broadcast_to(numbers, (count,))
 
 
 def _numbers(given: npt.ArrayLike) -> Array:

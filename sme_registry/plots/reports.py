@@ -113,10 +113,8 @@ def decay_curve(
                 draw_runs(axes, _levels(method.reports[0]), values, iqm, line, label)
             if len(runs) == 1:
                 _draw_agents(axes, runs[0], measure)
-            if references and isinstance(reports, Mapping):
-                _draw_mean_references(axes, runs, measure)
-            elif references:
-                _draw_references(axes, runs, measure)
+            if references:
+                _draw_references(axes, runs, measure, averaged=isinstance(reports, Mapping))
             _name_quartiles(axes, methods)
             _label_axes(axes, runs, measure)
     return figure_of(panels[0])
@@ -139,25 +137,22 @@ def _draw_agents(axes: Axes, report: EvaluationReport, measure: str) -> None:
         axes.plot(_levels(report), _values(agent.regions, measure), **style)
 
 
-def _draw_mean_references(axes: Axes, runs: Sequence[EvaluationReport], measure: str) -> None:
-    """The means of the references over all tasks, of those that every task has."""
+def _draw_references(
+    axes: Axes, runs: Sequence[EvaluationReport], measure: str, *, averaged: bool
+) -> None:
+    """The references, averaged over the tasks that share them; or of each task, with one label."""
+    tasks, digests = _first_on_task(runs), [report.spec_digest for report in runs]
     levels = _levels(runs[0])
-    tasks = [report for report in _first_on_task(runs).values() if _levels(report) == levels]
-    for name in runs[0].references:
-        if all(name in report.references for report in tasks):  # of safety not in every task
-            values = [_values(report.references[name], measure) for report in tasks]
-            draw_reference(axes, name, levels, np.mean(values, axis=0), LABELS.get(name, name))
-
-
-def _draw_references(axes: Axes, runs: Sequence[EvaluationReport], measure: str) -> None:
-    """The references of each task, with one entry in the legend."""
-    digests, tasks = [report.spec_digest for report in runs], _first_on_task(runs)
-    for digest, report in tasks.items():
-        colour = GREY if len(tasks) == 1 else COLOURS[digests.index(digest) % len(COLOURS)]
-        for name, regions in report.references.items():
-            label = LABELS.get(name, name) if report is runs[0] else "_another task"
-            values = _values(regions, measure)
-            draw_reference(axes, name, _levels(report), values, label, colour)
+    groups = [(GREY, [report for report in tasks.values() if _levels(report) == levels])]
+    if not averaged and len(tasks) > 1:
+        groups = [(look(digests.index(digest))["color"], [tasks[digest]]) for digest in tasks]
+    for colour, reports in groups:
+        for name in reports[0].references:
+            if all(name in report.references for report in reports):  # of safety not in every task
+                values = [_values(report.references[name], measure) for report in reports]
+                label = LABELS.get(name, name) if reports[0] is runs[0] else "_another task"
+                mean = np.mean(values, axis=0)
+                draw_reference(axes, name, _levels(reports[0]), mean, label, colour)
 
 
 def _first_on_task(runs: Iterable[EvaluationReport]) -> dict[str, EvaluationReport]:
