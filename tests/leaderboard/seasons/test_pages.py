@@ -17,7 +17,7 @@ from tests.leaderboard.seasons.sealing import (
     tiny_season,
 )
 from tests.leaderboard.web import boards, test_pages
-from tests.leaderboard.web.test_pages import Page
+from tests.page import Page
 
 HOSTILE = "Autumn <script>alert(1)</script>"
 OFFLINE, ONLINE = tiny_season(id="autumn", title=HOSTILE), tiny_season("sealed-online", id="winter")

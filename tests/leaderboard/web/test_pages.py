@@ -4,7 +4,6 @@ import posixpath
 import re
 import shutil
 from collections import Counter
-from html.parser import HTMLParser
 from urllib.parse import urlsplit
 from xml.etree import ElementTree
 
@@ -27,8 +26,8 @@ from leaderboard.web.server import write_site
 from sme_registry.errors import OptionError
 from tests.leaderboard.conftest import SEASONS, signed_withdrawal
 from tests.leaderboard.web import boards
+from tests.page import Page
 
-VOID = {"meta", "link", "input", "br", "img"}
 ELEMENTS = """
 html head meta title link script body a header footer main nav div section p span strong em small
 bdi ul li dl dt dd h1 h2 h3 table caption thead tbody tr th td form label input select option button
@@ -36,40 +35,6 @@ details summary code pre figure figcaption time br sub
 svg path line circle polyline polygon text desc
 """
 ALLOWED = set(ELEMENTS.split())
-
-
-class Page(HTMLParser):
-    """What a browser would make of a page: its elements and texts; ill nesting is an error."""
-
-    def __init__(self, text):
-        super().__init__(convert_charrefs=True)
-        self.elements, self.open, self.text = [], [], []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        names = [name for name, _ in attrs]
-        assert len(names) == len(set(names)), f"<{tag}> has an attribute twice"
-        self.elements.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag, f"</{tag}> closes another element"
-
-    def handle_data(self, data):
-        self.text.append((self.open[-1] if self.open else "", data))
-
-    def all(self, tag):
-        return [attributes for name, attributes in self.elements if name == tag]
-
-    @property
-    def words(self):
-        return " ".join("".join(data for _, data in self.text).split())
 
 
 @pytest.fixture(scope="module")

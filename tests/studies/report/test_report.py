@@ -4,7 +4,6 @@ import csv
 import re
 import shutil
 import subprocess
-from html.parser import HTMLParser
 
 import numpy as np
 import pandas as pd
@@ -17,6 +16,7 @@ from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.frames import records
 from tests.commands import good, refused
+from tests.page import Page
 from tests.studies.cells import small_file
 
 pytest.importorskip("matplotlib")
@@ -31,49 +31,6 @@ FIGURES = {
     "differences", "learning-curves-by-class",
     "learning-curves-r_min", "learning-curves-complexity", "learning-curves-several-axes",
 }  # fmt: skip
-
-
-class Page(HTMLParser):
-    """What a browser would make of the page: tags that close, ids, links, and what it loads."""
-
-    VOID = frozenset({"meta", "img", "br", "link", "input"})
-
-    def __init__(self, text):
-        super().__init__()
-        self.open = []
-        self.ids = []
-        self.links = []
-        self.loads = []
-        self.images = []
-        self.text = ""
-        self.feed(text)
-        self.text = " ".join(self.text.split())
-
-    def handle_starttag(self, tag, attrs):
-        attributes = dict(attrs)
-        if tag not in self.VOID:
-            self.open.append(tag)
-        if "id" in attributes:
-            self.ids.append(str(attributes["id"]))
-        if tag == "a":
-            self.links.append(str(attributes["href"]))
-        if tag == "img":
-            self.images.append(attributes)
-        sources = {"src", "data", "srcset"} & attributes.keys()
-        self.loads += [str(attributes[name]) for name in sources]
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if not {"style", "script"} & set(self.open):
-            self.text += data
-
-    def assert_whole(self):
-        """Every tag is closed, no id appears twice, and every link within the page leads to one."""
-        assert self.open == []
-        assert len(set(self.ids)) == len(self.ids)
-        assert all(link.removeprefix("#") in self.ids for link in self.links)
 
 
 @pytest.fixture(scope="module")
@@ -137,10 +94,13 @@ def test_the_command_writes_the_same_files_into_the_study_or_another_folder(
 def test_the_page_is_whole_loads_nothing_and_says_where_its_numbers_come_from(written, analysis):
     html = (written / "index.html").read_text()
     page = Page(html)
-    page.assert_whole()
-    assert len(page.images) == len(FIGURES)
-    assert all(image["alt"] for image in page.images)
-    assert all(source.startswith("data:image/svg+xml;base64,") for source in page.loads)
+    ids, images = page.values("id"), page.all("img")
+    assert len(set(ids)) == len(ids)
+    assert all(link.removeprefix("#") in ids for link in page.values("href"))
+    assert len(images) == len(FIGURES)
+    assert all(image["alt"] for image in images)
+    loaded = page.values("src", "data", "srcset")
+    assert all(source.startswith("data:image/svg+xml;base64,") for source in loaded)
     assert "default-src 'none'" in html
     assert "<script" not in html
     assert not re.search(r"url\(|@import", html)
@@ -152,8 +112,8 @@ def test_the_page_is_whole_loads_nothing_and_says_where_its_numbers_come_from(wr
         "Beta on k-25, run 3: failed: ValueError: <b>bad</b>",  # as text, not as a tag
         "Beta on k-25, run 4",
     ):
-        assert fact in page.text
-    assert "table-levels-wd-regret" in page.ids
+        assert fact in page.words
+    assert "table-levels-wd-regret" in ids
     levels = analysis.tables["levels"][analysis.tables["levels"].metric == "wd_regret"]
     assert all(f"<td>{row.iqm:.2f} [" in html for row in levels.itertuples())
 
@@ -201,10 +161,10 @@ def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     result = run_cell(planned.cell, model_path=model)
     ledger.write(result)
     (page,) = write_report(tmp_path, formats=["html"])
-    assert "figure-maps" not in Page(page.read_text()).ids
+    assert "figure-maps" not in Page(page.read_text()).values("id")
     ledger.write(result, model.read_bytes())
     page, explorer = write_report(tmp_path, formats=["html"], explorers=True)
-    assert "figure-maps" in Page(page.read_text()).ids
+    assert "figure-maps" in Page(page.read_text()).values("id")
     assert explorer.parent == page.parent / "explorers"
     assert f'<a href="explorers/{explorer.name}">PPO on small, run 0</a>' in page.read_text()
     assert '"of":"observation"' in explorer.read_text()
@@ -234,7 +194,7 @@ def test_algorithms_on_classes_without_any_run_are_not_missing(finished, tmp_pat
         if planned.class_name != "default":
             (study / "cells" / f"{planned.cell.digest[7:]}.json").unlink(missing_ok=True)
     (page,) = write_report(study, formats=["html"])
-    text = Page(page.read_text()).text
+    text = Page(page.read_text()).words
     assert "15 of 20 runs have finished. The plan has 55 more" in text  # one on k-25 has failed
 
 

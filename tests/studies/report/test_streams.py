@@ -26,8 +26,8 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report.write import page, write_report
 from tests.geometry import assert_readable
+from tests.page import Page
 from tests.studies.report.test_findings import found
-from tests.studies.report.test_report import Page
 
 FIGURES = {
     "stream-metrics", "stream-regret", "stream-plasticity", "stream-learning-curves",
@@ -69,7 +69,7 @@ def streams(study):
 
 def text_of(analysis):
     """The text of the page, without figures and tables."""
-    return Page(page(analysis)).text
+    return Page(page(analysis)).words
 
 
 def within(rows, **at):
@@ -351,12 +351,12 @@ def test_the_report_of_streams_alone_is_whole_readable_and_the_same_each_time(
 ):
     files = write_report(study, tmp_path / "one", ["html", "csv", "latex"], full=True)
     page = Page(files[0].read_text())
-    page.assert_whole()
-    names = [name.removeprefix("figure-") for name in page.ids if name.startswith("figure-")]
+    ids = page.values("id")
+    names = [name.removeprefix("figure-") for name in ids if name.startswith("figure-")]
     assert set(names) == FIGURES
-    assert "findings" not in page.ids
+    assert "findings" not in ids
     for words in ("120 of 120 runs have finished", "Tired forgets more than Stubborn"):
-        assert words in page.text
+        assert words in page.words
     rows = read_json(tmp_path / "one" / "findings.json")["findings"]
     forgetting = [row["class_name"] for row in rows if row["question"] == "forgetting"]
     assert list(dict.fromkeys(forgetting)) == [*STREAMS]
