@@ -145,11 +145,11 @@ class OfflinePolicy(Perceptron):
         activations = [*["relu"] * (len(layers) - 1), self._output]
         # Transposed views: copies would multiply in another order.
         self.layers = [(W.T, b, f) for (W, b), f in zip(layers, activations, strict=True)]
-        self.low, self.high = self._bounds()
+        self.low = self.high = None
+        if self._output == "tanh":
+            b = self.layers[-1][1]
+            self.low, self.high = np.zeros_like(b), np.ones_like(b)
         self.about = about
-
-    def _bounds(self) -> tuple[Weights, Weights] | tuple[None, None]:
-        return np.zeros(self.action_dim, np.float32), np.ones(self.action_dim, np.float32)
 
     @property
     def __name__(self) -> str:
@@ -212,6 +212,3 @@ class OfflineCritic(OfflinePolicy):
 
     kind = "sme-offline-critic"
     _output = "identity"
-
-    def _bounds(self) -> tuple[None, None]:
-        return None, None
