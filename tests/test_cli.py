@@ -645,8 +645,11 @@ SHORT = ("train", "Plane1", "-n", "120", *QUICK)
 
 
 class TestTrain:
-    def test_it_trains_on_a_stream_and_shows_what_was_retained_and_what_it_cost(self, tmp_path):
+    @pytest.fixture(autouse=True)
+    def _needs_sb3(self):
         pytest.importorskip("stable_baselines3")
+
+    def test_it_trains_on_a_stream_and_shows_what_was_retained_and_what_it_cost(self, tmp_path):
         task = SMESpec(state_dim=2, action_dim=2, horizon=20)
         phases = [{"spec": task, "steps": 40}, {"spec": task.derive(seed=1), "steps": 40}]
         save(StreamSpec(phases=phases), tmp_path / "mine.json")
@@ -662,7 +665,6 @@ class TestTrain:
         assert "All files are in runs/mine-PPO-seed0/" in result.stdout
 
     def test_it_trains_reports_and_says_where(self, tmp_path):
-        pytest.importorskip("stable_baselines3")
         result = good(*SHORT, "--json")
         printed = json.loads(result.stdout)
         assert printed["folder"] == "runs/Plane1-TD3-seed0"
@@ -679,7 +681,6 @@ class TestTrain:
         assert again["regions"] == printed["evaluation"]["regions"]
 
     def test_agents_in_jax_have_a_folder_of_their_own(self, tmp_path):
-        pytest.importorskip("stable_baselines3")
         pytest.importorskip("jax")
         narrow = ("--set", "n_steps=32", "--set", "batch_size=32", "--set", "n_epochs=1")
         command = ("train", "Plane1", "-a", "ppo", "--agents", "jax", "-n", "40", *narrow, *QUICK)
@@ -706,12 +707,10 @@ class TestTrain:
         ],
     )
     def test_bad_input_writes_nothing(self, options, message, tmp_path):
-        pytest.importorskip("stable_baselines3")
         assert message in refused(*SHORT, *options)
         assert list(tmp_path.iterdir()) == []
 
     def test_hyperparameters_come_from_options_and_a_file(self, tmp_path):
-        pytest.importorskip("stable_baselines3")
         (tmp_path / "settings.json").write_text('{"gamma": 0.9}')
         file = ("--hyperparameters", "settings.json")
         options = ("--set", "policy_kwargs.net_arch=[8]", "--set", "k=2", *file)
@@ -724,7 +723,6 @@ class TestTrain:
         assert "sets it, too" in refused(*SHORT, *file, "--set", "gamma=0.8")
 
     def test_a_team_is_trained_with_its_regret_shown_and_its_model_evaluated(self, tmp_path):
-        pytest.importorskip("stable_baselines3")
         command = ("train", "SME/Team2-v1", "-n", "300", "--set", "horizon=20", *QUICK)
         result = good(*command, "--out", "run", "--json")
         printed = json.loads(result.stdout)
@@ -742,7 +740,6 @@ class TestTrain:
         assert "shape" in refused("evaluate", "run/model.zip", "Default", *QUICK)
 
     def test_an_interrupt_says_how_to_go_on_and_going_on_works(self, tmp_path):
-        pytest.importorskip("stable_baselines3")
         command = ("train", "Plane1", "--out", "run", "--checkpoint-every", "50", *QUICK)
         process = subprocess.Popen(
             [*SME, *command, "-n", "100000"],

@@ -1,7 +1,5 @@
 """`SMETeamVecEnv`: a policy shared by the agents of a team, on the numbers of `SMETeamEnv`."""
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -140,29 +138,6 @@ def test_options_begin_teams_where_they_say_and_are_used_once():
     assert list(drawn) != start
     env.reset()
     assert list(env.get_attr("state", 3)[0]) != start
-
-
-def test_what_is_returned_can_be_written_into_and_a_copy_goes_on_as_the_original():
-    env, untouched = SMETeamVecEnv(UNEQUAL, 2), SMETeamVecEnv(UNEQUAL, 2)
-    rng = np.random.default_rng(0)
-    for e in (env, untouched):
-        e.seed(0)
-        e.reset()
-    for t in range(30):
-        action = rng.uniform(-1, 1, (6, 3)).astype(np.float32)
-        got, expected = env.step(action), untouched.step(action)
-        for array, other in zip(got[:3], expected[:3], strict=True):
-            np.testing.assert_array_equal(array, other)
-        for info, other in zip(got[3], expected[3], strict=True):
-            np.testing.assert_equal(info, other)
-            info["optimal_action"][:] = 9.0
-            info.get("terminal_observation", got[0])[:] = 9.0
-            info.clear()
-        for array in got[:3]:
-            array[:] = 9
-        if t == 5:
-            env = pickle.loads(pickle.dumps(env))
-    np.testing.assert_array_equal(env.get_attr("state"), untouched.get_attr("state"))
 
 
 def test_what_cannot_be_used_is_a_typed_error():

@@ -35,14 +35,6 @@ def mixed(task, s, rng):
     return (1.0 - share) * best + share * rng.uniform(-0.1, 1.1, best.shape)
 
 
-@pytest.fixture(params=["numba", "numpy"])
-def backend(request, monkeypatch):
-    if request.param == "numba":
-        pytest.importorskip("numba")
-    monkeypatch.setenv("SME_BACKEND", request.param)
-    return str(request.param)
-
-
 @pytest.mark.parametrize("lanes", [1, 131])
 @pytest.mark.parametrize("name", SPECS)
 def test_a_batch_is_the_loop_of_its_teams_over_whole_episodes(name, lanes, backend):

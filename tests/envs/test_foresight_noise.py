@@ -40,13 +40,6 @@ DOCUMENTS = {
 }
 
 
-@pytest.fixture(params=["numba", "numpy"])
-def backend(request, monkeypatch):
-    if request.param == "numba":
-        pytest.importorskip("numba")
-    monkeypatch.setenv("SME_BACKEND", request.param)
-
-
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_shaping_adds_up_to_the_first_potential_and_all_environments_agree(name, backend):
     sb3 = pytest.importorskip("sme_registry.sb3")
@@ -189,9 +182,3 @@ def test_each_stream_of_random_numbers_is_its_own():
 def test_bad_fields_are_refused_with_the_remedy(fields, message):
     with pytest.raises(SpecError, match=message):
         SMESpec(**fields)
-
-
-def test_old_digests_stay_and_defaults_of_blocks_are_absent():
-    assert "shaping" not in SMESpec().to_dict()
-    assert SMESpec(shaping=SHAPING).to_dict()["shaping"] == SHAPING
-    assert SMESpec(safety={"tightness": 0.2}).to_dict()["safety"] == {"tightness": 0.2}

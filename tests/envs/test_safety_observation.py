@@ -44,14 +44,6 @@ SPECS = {
 }
 
 
-@pytest.fixture(params=["numba", "numpy"])
-def backend(request, monkeypatch):
-    if request.param == "numba":
-        pytest.importorskip("numba")
-    monkeypatch.setenv("SME_BACKEND", request.param)
-    return str(request.param)
-
-
 def actions_of(env, rng):
     """Actions between the optimum and noise."""
     best = env.task.optimal_action(env.state)
@@ -139,27 +131,6 @@ def test_noise_and_first_distractors_follow_the_streams_definition(backend):
             env.step(np.full(4, 0.5, np.float32))
 
 
-@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_the_safe_action_costs_nothing_and_has_no_safe_regret(action_range):
-    env, A = SMEEnv(SPECS["safe"], action_range=action_range), 4
-    env.reset(seed=0)
-    violated = 0
-    for _ in range(20):
-        probe = copy.deepcopy(env).step(np.zeros(A, np.float32))[4]
-        best = copy.deepcopy(env).step(probe["optimal_action"])[4]
-        safe = copy.deepcopy(env).step(probe["safe_action"])[4]
-        assert safe["cost"] <= 1e-15
-        assert safe["safe_regret"] == pytest.approx(0.0, abs=1e-12)
-        assert (probe["safe_action"] <= probe["limit"]).all()
-        assert best["safe_regret"] == pytest.approx(safe["step_reward"] - 1.0, abs=1e-12)
-        over = np.maximum(0.0, probe["optimal_action"] - probe["limit"]).mean()
-        scale = 2.0 * 0.2 * (2.0 if action_range == "symmetric" else 1.0)
-        assert best["cost"] == pytest.approx(over / scale, abs=1e-12)
-        violated += best["cost"] > 0
-        env.step(probe["safe_action"])
-    assert violated > 5
-
-
 @pytest.mark.parametrize("name", ["noise", "driven"])
 def test_a_reset_begins_at_the_state_and_the_distractors_that_are_given(name):
     spec = SPECS[name]
@@ -230,16 +201,6 @@ def test_a_generator_of_the_users_serves():
         np.testing.assert_array_equal(env.state, plain.random(8))
         assert first is None or (env.distractors != first).all()
         first = env.distractors
-
-
-def test_frames_show_tasks_with_distractors_and_limits():
-    pytest.importorskip("pygame")
-    env = SMEEnv(SPECS["both"], render_mode="rgb_array")
-    frames = SMEVectorEnv(SPECS["both"], 2, render_mode="rgb_array")
-    for each in (env, frames):
-        each.reset(seed=0)
-        each.step(np.full(each.action_space.shape, 0.4, np.float32))
-    np.testing.assert_array_equal(env.render(), (frames.render() or ())[0])
 
 
 @pytest.mark.parametrize(("name", "field"), [("safe", "safety"), ("noise", "observation")])

@@ -45,20 +45,6 @@ def test_spaces_are_each_agents_own_and_the_same_object_each_time():
     assert env.action_space("driver_0").low.tolist() == [-1.0] * 3
 
 
-def test_symmetric_actions_are_the_unit_ones_rescaled_and_both_are_clipped():
-    unit, symmetric = begun("DuoDeep"), begun("DuoDeep", action_range="symmetric")
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        joint = {n: rng.integers(-9, 270, unit.action_space(n).shape) / 256 for n in unit.agents}
-        ours = unit.step({name: np.clip(a, 0.0, 1.0) for name, a in joint.items()})
-        theirs = symmetric.step({name: 2.0 * a - 1.0 for name, a in joint.items()})
-        np.testing.assert_array_equal(unit.state(), symmetric.state())
-        assert ours[1:4] == theirs[1:4]
-        for name, info in ours[4].items():
-            rescaled = 2.0 * info["optimal_action"] - 1.0
-            np.testing.assert_array_equal(theirs[4][name]["optimal_action"], rescaled)
-
-
 def test_bad_actions_are_refused_by_their_agents_name_and_nothing_moves():
     env, twin = begun(k=3), begun(k=3)
     good = middle(env)
@@ -178,20 +164,6 @@ def test_gymnasiums_environments_refuse_a_team_and_say_what_to_use():
     ):
         with pytest.raises(SpecError, match=r"team: .* for 4 agents .*make_parallel"):
             make()
-
-
-def test_what_is_handed_out_can_be_written_into():
-    env, twin = begun(), begun()
-    for _ in range(3):
-        observations, _, _, _, infos = env.step(middle(env))
-        twin.step(middle(twin))
-        for name in env.possible_agents:
-            observations[name][:] = -7.0
-            infos[name]["optimal_action"][:] = -7.0
-            infos[name].clear()
-        env.agents.clear()
-        env.agents.extend(env.possible_agents)
-    np.testing.assert_array_equal(env.state(), twin.state())
 
 
 def test_a_rendered_team_is_a_picture_of_all_its_channels():

@@ -91,14 +91,6 @@ def test_what_names_nothing_at_all_is_refused():
             resolve(path)
 
 
-def test_a_bare_spec_is_distinguished_from_a_file(tmp_path):
-    path = tmp_path / "bare.json"
-    path.write_text(SMESpec(k=5).model_dump_json())
-    for kind in (None, SMESpec):
-        with pytest.raises(MalformedDocumentError, match=r"bare spec.*sme_registry\.save"):
-            resolve(path, kind)
-
-
 def test_a_single_axis_has_one_class_for_each_value():
     classes = sweep(SMESpec(seed=3), {"r_min": [0, 0.25, 0.5]}, instances=2)
     assert [member.name for member in classes] == ["r_min-0", "r_min-0_25", "r_min-0_5"]

@@ -41,14 +41,6 @@ def test_with_even_dimension_pre_activations_correlate_with_the_cosine(S, theta,
     np.testing.assert_allclose(correlation, math.cos(theta - other), rtol=0, atol=1e-12)
 
 
-@given(st.integers(2, 9), ANGLES)
-def test_a_rotation_is_orthogonal_and_the_same_after_a_full_turn(S, theta):
-    R = rotation(theta, S)
-    np.testing.assert_allclose(R @ R.T, np.eye(S), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(rotation(theta + 2.0 * math.pi, S), R, rtol=0, atol=2e-14)
-    np.testing.assert_allclose(rotation(0.0, S), np.eye(S), rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize("S", [2, 5, 8])
 def test_a_rotation_is_two_by_two_in_the_planes_of_a_haar_basis(S):
     theta, blocks = 0.7, np.eye(S)

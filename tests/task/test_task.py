@@ -30,13 +30,6 @@ def test_the_transition_is_the_arc_cosine_of_the_method_and_stays_in_the_cube(sp
     assert ((moved >= 0.0) & (moved <= 1.0)).all()
 
 
-def test_the_triangle_wave_has_its_values_at_its_corners():
-    task = materialize(SMESpec(state_dim=1, action_dim=1))
-    b = float(task.b[0])
-    for y, folded in [(0.0, 0.0), (0.25, 0.5), (0.5, 1.0), (0.75, 0.5), (1.0, 0.0), (-0.125, 0.25)]:
-        assert task.transition([y - b], [0.0])[0] == pytest.approx(folded, abs=1e-15)
-
-
 def constant_similarity(**fields):
     """Mean r̃ of the constant policy ½ over four draws of a plane task."""
     tasks = [materialize(SMESpec(state_dim=2, action_dim=2, seed=i, **fields)) for i in range(4)]
