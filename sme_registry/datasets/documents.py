@@ -3,17 +3,8 @@
 On one machine the same recipe gives the same bits of every array. On another machine it gives the
 same numbers as far as NumPy, SciPy and LAPACK agree, as for the tasks themselves.
 
-| hyperparameter | BC | IQL | source of the default |
-|---|---|---|---|
-| hidden layers, ReLU | 256, 256 | 256, 256 in each network | IQL's paper; d3rlpy |
-| Adam's learning rate | 1e-3 | 3e-4 for actor, critics and value | d3rlpy's BC; IQL's paper |
-| discount γ | – | 0.99 | IQL's paper |
-| expectile τ | – | 0.7 | METHOD, section 4; IQL's paper on locomotion |
-| inverse temperature β | – | 3.0, weights at most 100 | IQL's paper on locomotion |
-| soft update of the target critics | – | 0.005 each step | IQL's paper |
-
-IQL's paper (see `learners`) also decays the actor's learning rate by a cosine; neither d3rlpy nor
-this package does.
+Default hyperparameters are those of d3rlpy's BC and of IQL's paper (see `learners`), which also
+decays the actor's learning rate; neither d3rlpy nor this package does.
 """
 
 from __future__ import annotations

@@ -177,11 +177,7 @@ class IQL(Networks):
 
 
 class OfflineLearner:
-    """A policy that learns from the rows of a data set by gradient steps, on one thread.
-
-    `about` is of the policy; its seed is that of initial weights and shuffles. PyTorch's own number
-    of threads and global generator are unchanged.
-    """
+    """A policy that learns from a data set by gradient steps, on one thread."""
 
     def __init__(
         self,

@@ -29,49 +29,29 @@ _REGRET, _SAFETY_SUMS = 2, slice(4, 7)
 class EpisodeSafety(NamedTuple):
     """Means over the steps of an episode of a task with `safety`.
 
-    Attributes:
-      cost: the mean cost, in [0, 1].
-      violating_share: the share of steps whose action was above its limits by more than 10⁻⁶,
-        summed over channels (6·10⁻⁸ A where A > 16), in [0, 1]. Infos have no action, so this is
-        not evaluation's rule, by which one channel must be: it differs where several are above by
-        less.
-      safe_regret: mean step reward that the best safe action earns more, in [−1, 1]; negative
-        where the agent earned by violating.
+    A step is violating if its action was above its limits by more than 10⁻⁶, summed over channels
+    (6·10⁻⁸ A where A > 16). Infos have no action, so this is not evaluation's rule, by which one
+    channel must be: it differs where several are above by less.
     """
 
-    cost: float
-    violating_share: float
-    safe_regret: float
+    cost: float  # in [0, 1]
+    violating_share: float  # in [0, 1]
+    safe_regret: float  # in [−1, 1]: what the best safe action earns more in a step
 
 
 class Episode(NamedTuple):
-    """A finished episode; of a team, one episode of the whole team.
+    """A finished episode; of a team, one of the whole team, whose numbers are means over agents."""
 
-    Attributes:
-      episode: its number, from 1.
-      step: environment steps over all environments when it ended; a step of a team is one step of
-        all its agents.
-      episode_return: sum of its rewards, in [0, T]. For a team, this, `regret` and `similarity`
-        are means over its agents.
-      length: number of steps.
-      regret: mean of 1 − r over its steps, in [0, 1]; exact.
-      similarity: mean r̃ over its steps, in [0, 1]; exact.
-      terminated: 1 if it ended by D, 0 if it reached the horizon.
-      wall_seconds: since the beginning when it ended.
-      agents_regret: mean regret of each agent, in the team's order; empty for a single agent.
-      safety: what it cost; None for a task without `safety`.
-    """
-
-    episode: int
-    step: int
-    episode_return: float
-    length: int
-    regret: float
-    similarity: float
-    terminated: int
-    wall_seconds: float
-    agents_regret: tuple[float, ...] = ()
-    safety: EpisodeSafety | None = None
+    episode: int  # its number, from 1
+    step: int  # of all environments when it ended; a step of a team is one of all its agents
+    episode_return: float  # sum of its rewards
+    length: int  # steps
+    regret: float  # mean of 1 − r over its steps, in [0, 1]; exact
+    similarity: float  # mean r̃ over its steps, in [0, 1]; exact
+    terminated: int  # 1 if it ended by D, 0 if it reached the horizon
+    wall_seconds: float  # since the beginning when it ended
+    agents_regret: tuple[float, ...] = ()  # of each agent, in the team's order; of a team only
+    safety: EpisodeSafety | None = None  # None for a task without `safety`
 
 
 class Episodes:

@@ -368,10 +368,7 @@ _INVISIBLE = re.compile(
 
 
 def hidden_in(text: str) -> set[str]:
-    """The characters of a text that a terminal obeys or does not show, but for line breaks.
-
-    They are control characters, marks of direction, and letters without ink or width.
-    """
+    """The characters of a text that a terminal obeys or does not show, but for line breaks."""
     if text.isascii() and text.isprintable():
         return set()
     hidden = {letter for letter in text if not letter.isprintable()} - {"\n"}

@@ -64,10 +64,7 @@ _UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
 
 
 class _Console(Console):
-    """Shows hidden characters as escapes and `:x:` as it is: a name from elsewhere may hold any.
-
-    It wraps no lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
-    """
+    """Shows hidden characters as escapes, and wraps no lines of output that is no terminal."""
 
     def __init__(self, file: TextIO) -> None:
         super().__init__(file=file, highlight=False, emoji=False)
@@ -174,8 +171,8 @@ class Progress:
         self._title, self._unit = title, unit
         self._total, self._done_before, self._done = total, done, done
         self._rate_from: tuple[int, float] | None = None  # steps and time; None while it prepares
-        self._console = console or err()
-        self._enabled = enabled
+        nowhere = Console(quiet=True, force_terminal=False)
+        self._console = (console or err()) if enabled else nowhere
         self._note = ""
         self._parts: dict[str, str] = {}  # how far they are
         self._start = self._last = time.monotonic()
@@ -186,7 +183,7 @@ class Progress:
     def __enter__(self) -> Self:
         self._start = self._last = time.monotonic()
         self._rate_from = self._done, self._start
-        if self._enabled and self._console.is_terminal:
+        if self._console.is_terminal:
             self._bars = Bars(
                 TextColumn("{task.description}", markup=False),  # else :x: becomes an emoji
                 BarColumn(bar_width=24),
@@ -210,7 +207,7 @@ class Progress:
         if self._bars is not None:
             self._draw()
             self._bars.stop()
-        elif self._enabled and error is None and self._done_before < self._done >= self._total:
+        elif error is None and self._done_before < self._done >= self._total:
             self._print()
 
     def prepare(self, note: str) -> None:
@@ -255,8 +252,7 @@ class Progress:
 
     def message(self, text: str) -> None:
         """Print a line of its own, above the bars."""
-        if self._enabled:
-            self._console.print(escape(text), highlight=False, soft_wrap=True)
+        self._console.print(escape(text), highlight=False, soft_wrap=True)
 
     def _remove(self, name: str) -> None:
         self._parts.pop(name, None)
@@ -265,8 +261,6 @@ class Progress:
 
     def _refresh(self) -> None:
         now = time.monotonic()
-        if not self._enabled:
-            return
         if self._bars is not None:
             if now - self._last >= _SECONDS_BETWEEN_BARS:
                 self._last = now
@@ -398,10 +392,7 @@ _MOST_OPTIONS = 10  # of a command, with --help, before those in the panel "Adva
 
 
 def _arrange_help(command: Any) -> None:
-    """Make the help of a command and of all in it show as it is written, in paragraphs.
-
-    Options are declared by importance: those after the first are in a panel of their own.
-    """
+    """Show the help of a command and of all in it in paragraphs, and later options in a panel."""
     for each in (command, *command.params):
         if getattr(each, "help", None):
             each.help = escape(_in_paragraphs(inspect.cleandoc(each.help)))

@@ -115,38 +115,26 @@ MEANINGS["distinct_distractors"] = MEANINGS["distinct_states"].replace(
 
 @dataclass(frozen=True)
 class Check:
-    """One measured number of a task, and its range.
+    """One measured number of a task, and the range in which it passes.
 
-    Attributes:
-      name: of the number.
-      value: the number; None where it was not measured; `meaning` gives the reason.
-      low, high: the range in which it passes; None where there is no bound on that side.
-      outcome: "passed"; "warning" for an easy task, or one whose limits bind more or less often
-        than its tightness says; "refused" for a broken or trivial one; "reported" for numbers
-        without a range.
-      meaning: one sentence for the reader.
+    A warning is of an easy task, or one whose limits bind more or less often than its tightness
+    says; refused is a broken or trivial one; only reported are numbers without a range.
     """
 
     name: str
-    value: float | None
-    low: float | None
+    value: float | None  # None where it was not measured; `meaning` gives the reason
+    low: float | None  # None where there is no bound on that side
     high: float | None
     outcome: Outcome
-    meaning: str
+    meaning: str  # one sentence for the reader
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result of `certify`.
+    """The result of `certify`."""
 
-    Attributes:
-      digest: of the spec.
-      seed: of the states and actions that it was measured with; not the task's.
-      checks: in the order of `certify`.
-    """
-
-    digest: str
-    seed: int
+    digest: str  # of the spec
+    seed: int  # of the states and actions that it was measured with; not the task's
     checks: tuple[Check, ...]
 
     @property
