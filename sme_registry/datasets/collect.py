@@ -370,7 +370,13 @@ def reference_scores(
         if count == 0:
             return None
         start = f"{stream}/{index}/start"
-        return _scores(*whole_episodes(task, policy, recipe.seed, start, count))
+        returns, similarities, steps = whole_episodes(task, policy, recipe.seed, start, count)
+        return EpisodeScores(
+            episodes=count,
+            mean_return=returns.mean(),
+            standard_error=returns.std(ddof=1) / math.sqrt(count) if count > 1 else 0.0,
+            similarity=min(1.0, similarities.sum() / steps.sum()),
+        )
 
     behaviours = []
     for index in range(len(recipe.behaviours)):
@@ -418,16 +424,6 @@ def whole_episodes(
         sums += step.running * np.stack([reward, similarity, np.ones(count)])
     returns, similarities, steps = sums
     return returns, similarities, steps
-
-
-def _scores(returns: Array, similarities: Array, steps: Array) -> EpisodeScores:
-    count = len(returns)
-    return EpisodeScores(
-        episodes=count,
-        mean_return=returns.mean(),
-        standard_error=returns.std(ddof=1) / math.sqrt(count) if count > 1 else 0.0,
-        similarity=min(1.0, similarities.sum() / steps.sum()),
-    )
 
 
 def _weighted(recipe: DatasetRecipe, scores: list[PolicyScore]) -> EpisodeScores | None:

@@ -7,7 +7,6 @@ exact. A phase is one segment, or n short ones whose `rotation` moves in equal i
 from __future__ import annotations
 
 import os
-from bisect import bisect_right
 from collections.abc import Iterator
 from functools import lru_cache, partial
 from itertools import accumulate
@@ -221,13 +220,10 @@ class StreamSpec(NamedDocument):
         segments = tuple((segment.phase, segment.start) for segment in self.segments)
         return segments, self.cycle_steps, self.cycles, self.switch, self.observes_phase
 
-    def visit_ends(self, after: int = 0) -> Iterator[tuple[int, int]]:
-        """The index v of each visit, of phase v mod P, that ends after a lifetime, and its end."""
-        ends, length = [*accumulate(phase.steps for phase in self.phases)], self.cycle_steps
-        P = len(ends)
-        first = after // length * P + bisect_right(ends, after % length)
-        for visit in range(first, self.visits):
-            yield visit, visit // P * length + ends[visit % P]
+    def visit_ends(self) -> Iterator[tuple[int, int]]:
+        """The index v of each visit, of phase v mod P, and the lifetime at its end."""
+        steps = (phase.steps for _ in range(self.cycles) for phase in self.phases)
+        return enumerate(accumulate(steps))
 
     def draw(self, number: int) -> StreamSpec:
         """The same stream with other tasks: number · 10⁶ is added to the seed of every phase.

@@ -79,7 +79,8 @@ def _fast(policy: Policy, model: Any, observation_dim: int) -> Policy:
 
 def _perceptron(network: Any) -> Perceptron | None:
     """A copy of a PyTorch policy of SB3; None if there is none or it has other layers."""
-    if network is None or not _is_of_sb3(network):
+    packages = ("stable_baselines3.", "sb3_contrib.")  # whose policies act as their layers say
+    if network is None or not type(network)._predict.__module__.startswith(packages):
         return None
     from stable_baselines3.common.torch_layers import FlattenExtractor
     from torch import nn
@@ -105,12 +106,6 @@ def _perceptron(network: Any) -> Perceptron | None:
         return Perceptron(layers, *(() if space is None else (space.low, space.high)))
     except PolicyError:  # weights that are not finite
         return None
-
-
-def _is_of_sb3(network: Any) -> bool:
-    """Whether a policy acts as its layers say."""
-    packages = ("stable_baselines3.", "sb3_contrib.")
-    return type(network)._predict.__module__.startswith(packages)  # type: ignore[no-any-return]
 
 
 def _parts(network: Any) -> tuple[Any, tuple[Any, ...]]:
