@@ -316,30 +316,26 @@ def training(log: Log, constant_regret: float) -> TrainingSummary:
     )
 
 
-def exploration(model: Any, policy: Policy) -> Callable[[Observation], Array] | None:
-    """The stochastic actions of a Stable-Baselines3 model, clipped, in the unit range; or None."""
+def exploration_sd(
+    model: Any, policy: Policy, observation: Observation, seed: int
+) -> tuple[float, ...] | None:
+    """The standard deviation in a state of the clipped stochastic actions of a model of
+    Stable-Baselines3, in the unit range, by action channel, over a few states; None of any other.
+    """
     if not hasattr(getattr(model, "policy", None), "squash_output"):
         return None
-    noise = getattr(model, "action_noise", None)
+    noise, observation = getattr(model, "action_noise", None), observation[:_EXPLORATION_STATES]
+    shape = len(observation), policy.action_dim
 
-    def explore(observation: Observation) -> Array:
-        predicted: tuple[Any, Any] = model.predict(observation, deterministic=False)
-        shape = (len(observation), policy.action_dim)
+    def explore() -> Array:
+        predicted: tuple[Any, Any] = model.predict(observation.copy(), deterministic=False)
         a = arguments.to_unit(predicted[0], shape, policy.action_range == "symmetric")
         if noise is not None:  # added to actions in [−1, 1], one environment after another
             a += 0.5 * np.array([np.ravel(noise())[: shape[1]] for _ in range(shape[0])], float)
-        return np.asarray(np.clip(a, 0.0, 1.0))
+        return np.clip(a, 0.0, 1.0)
 
-    return explore
-
-
-def exploration_sd(
-    explore: Callable[[Observation], Any], observation: Observation, seed: int
-) -> tuple[float, ...]:
-    """The standard deviation of exploration in a state, by action channel, over a few states."""
     with _torch_seed(seed):
-        observation = observation[:_EXPLORATION_STATES]
-        sampled = np.array([explore(observation.copy()) for _ in range(_EXPLORATION_SAMPLES)])
+        sampled = np.array([explore() for _ in range(_EXPLORATION_SAMPLES)])
     return tuple(np.sqrt(sampled.var(axis=0, ddof=1).mean(axis=0)).tolist())
 
 

@@ -5,7 +5,7 @@ A life in a stream is its report and the networks at the ends of the visits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -15,7 +15,7 @@ from pydantic import JsonValue
 
 from sme_registry.datasets import offline
 from sme_registry.datasets.documents import OfflineRecord
-from sme_registry.diagnosis.behaviour import Log, exploration
+from sme_registry.diagnosis.behaviour import Log
 from sme_registry.diagnosis.critics import OfflineAgent
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.evaluation import Policy, StreamReport
@@ -24,7 +24,6 @@ from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.policies import TeamPolicy, as_policy
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.task.task import Observation
 from sme_registry.training import record as run_files
 from sme_registry.training.algorithms import backend_of, find, parse_uses
 from sme_registry.training.numpy_policy import numpy_policy
@@ -42,7 +41,6 @@ class Subject:
     policy: Policy | TeamPolicy  # from observations to actions in the unit range, unclipped
     plan: dict[str, JsonValue] = field(default_factory=dict)  # algorithm, seed, steps and so on
     log: Log | None = None  # of a single agent
-    explore: Callable[[Observation], Any] | None = None  # the algorithm's stochastic actions
     checkpoint_step: int | None = None  # of an unfinished run, the steps at its checkpoint
     updates: int | None = None  # of the algorithm; None if unknown
     model: Any = None  # of Stable-Baselines3, or an OfflineAgent, which may have a critic
@@ -178,8 +176,8 @@ def subject_of(
         team = as_policy(model, spec, action_range=action_range)
         return Subject(name or team.name, spec, team, **known)
     policy = numpy_policy(model, spec, action_range=action_range)
-    explore, model = exploration(model, policy), OfflineAgent.of(model) or model
-    return Subject(name or policy.name, spec, policy, explore=explore, model=model, **known)
+    model = OfflineAgent.of(model) or model
+    return Subject(name or policy.name, spec, policy, model=model, **known)
 
 
 def networks_of(

@@ -102,9 +102,8 @@ def _measurements(
     if subject.log is not None:
         constant = min(on_policy.scores[name].regret for name in behaviour.CONSTANTS)
         fields["training"] = behaviour.training(subject.log, constant)
-    if subject.explore is not None:
-        explored = behaviour.exploration_sd(subject.explore, sample.observation, seed)
-        fields["exploration_sd"] = explored
+    explored = behaviour.exploration_sd(subject.model, policy, sample.observation, seed)
+    fields["exploration_sd"] = explored
     if has_critic(subject.model, task):
         report(f"{subject.name}: the critic against exact values")
         fields["critic"] = critic(subject.model, task, states=min(states, 500), seed=seed)

@@ -72,11 +72,15 @@ def _out_of_distribution(run: TaskDiagnosis) -> Decision:
 def _time_in_episode(run: TaskDiagnosis) -> Decision:
     episodes = run.measurements.on_policy
     first, last = episodes.mae[0], episodes.mae[-1]
-    low, high = sorted((first, last))
-    apart = high - low >= THRESHOLDS["time_difference"]
-    changes = apart and high >= THRESHOLDS["time_ratio"] * max(low, TINY)
-    share = 1.0 - low / max(episodes.scores[POLICY].mae, TINY)
-    return Decision(changes, {"first_mae": first, "last_mae": last}, share)
+    share = 1.0 - min(first, last) / max(episodes.scores[POLICY].mae, TINY)
+    return Decision(_apart(first, last, "time"), {"first_mae": first, "last_mae": last}, share)
+
+
+def _apart(one: float, other: float, what: str) -> bool:
+    """Whether two numbers differ by the thresholds' difference and ratio."""
+    low, high = sorted((one, other))
+    apart = high - low >= THRESHOLDS[f"{what}_difference"]
+    return apart and high >= THRESHOLDS[f"{what}_ratio"] * max(low, TINY)
 
 
 @_where(
@@ -87,10 +91,8 @@ def _time_in_episode(run: TaskDiagnosis) -> Decision:
 def _visited_states(run: TaskDiagnosis) -> Decision:
     episodes, uniform = run.measurements.on_policy, run.learnt
     visited = episodes.scores[POLICY].normalised_regret
-    low, high = sorted((visited, uniform))
-    apart = high - low >= THRESHOLDS["on_policy_difference"]
     reason = "similar_regret"
-    if apart and high >= THRESHOLDS["on_policy_ratio"] * max(low, TINY):
+    if _apart(visited, uniform, "on_policy"):
         lower = visited < uniform
         reason = "lower_regret_where_visited" if lower else "higher_regret_where_visited"
     shift = max(episodes.state_shift)
@@ -100,7 +102,8 @@ def _visited_states(run: TaskDiagnosis) -> Decision:
         "shifted_state_channel": episodes.state_shift.index(shift) + 1,
         "state_shift": shift,
     }
-    return Decision(reason, evidence, 1.0 - low / max(high, TINY))
+    share = 1.0 - min(visited, uniform) / max(visited, uniform, TINY)
+    return Decision(reason, evidence, share)
 
 
 @_where(yes="offset_dominant", no="offset_minor", thresholds="dominant_share")

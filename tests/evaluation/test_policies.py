@@ -69,16 +69,6 @@ def test_a_policy_is_given_float32_observations_that_it_may_overwrite():
     assert seen == [(np.float32, (200, 5))] * 3
 
 
-@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
-def test_actions_are_clipped_and_the_clipped_share_is_counted():
-    report = evaluated(constant(-0.2, 1.0))
-    assert [region.clipped_share for region in report.regions] == [0.5] * 3
-    assert report.regions == tuple(
-        region.model_copy(update={"clipped_share": 0.5})
-        for region in evaluated(constant(0.0, 1.0)).regions
-    )
-
-
 def test_symmetric_actions_are_rescaled():
     symmetric = evaluated(constant(-0.5, 1.0), action_range="symmetric")
     assert symmetric.action_range == "symmetric"
@@ -181,12 +171,6 @@ def untrained(package, algorithm, action_range="unit", policy="MlpPolicy"):
     return getattr(package, algorithm)(policy, env, device="cpu", seed=3)
 
 
-@pytest.fixture(scope="module")
-def ppo(sb3):
-    """A model of which nobody changes anything."""
-    return untrained(sb3, "PPO")
-
-
 @pytest.mark.parametrize(
     "algorithm", ["PPO", "A2C", "SAC", "TD3", "TQC", "TRPO", "CrossQ", "RecurrentPPO"]
 )
@@ -284,17 +268,10 @@ def test_a_model_scores_as_its_deterministic_predictions(sb3, algorithm, action_
         assert 0.05 < own.regions[0].clipped_share < 0.95
 
 
-@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
-def test_evaluating_a_model_leaves_its_training_mode_alone(ppo):
-    for mode in (True, False):
-        ppo.policy.set_training_mode(mode)
-        evaluated(ppo)
-        assert ppo.policy.training is mode
-
-
-def test_a_model_that_does_not_fit_is_refused(sb3, ppo):
+def test_a_model_that_does_not_fit_is_refused(sb3):
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+    ppo = untrained(sb3, "PPO")
     with pytest.raises(PolicyError, match=r"its observations have shape \(5,\): must be \(10,\)"):
         evaluate(ppo, "Default-v1", PROTOCOL)
     with pytest.raises(PolicyError, match=r"its actions have shape \(2,\): must be \(1,\)"):
