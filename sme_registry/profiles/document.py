@@ -151,7 +151,6 @@ class Profile(StrictModel):
 
     @property
     def name(self) -> str:
-        """The algorithm's name."""
         return self.algorithm.name
 
     def comparable(self, others: Iterable[Profile]) -> list[Profile]:
@@ -319,7 +318,6 @@ def _kept(runs: Any) -> Array:
 
 
 def row_of(planned: PlannedCell, result: CellResult) -> ProfileRow:
-    """The row of a finished cell."""
     report, curve = result.report, result.curve
     assert report is not None  # the plan has no streams
     constant = 1.0 - report.references["constant"][0].similarity

@@ -74,7 +74,6 @@ def _draw_line(axes: Axes, profile: Profile, axis: Axis, look: Look, *, front: b
 
 @styled()
 def draw_robustness(profile: Profile, others: Sequence[Profile]) -> Figure:
-    """What is kept of the performance along each axis, a row each."""
     looks, by_name = _looks(profile, others), {each.name: each for each in (profile, *others)}
     figure = new_figure((WIDTH, 1.2 + 0.36 * len(AXES)))
     axes = figure.add_subplot()

@@ -295,12 +295,10 @@ class StudyStatus:
         return tuple(first.values())
 
     def count(self, state: State) -> int:
-        """How many cells are in this state."""
         return sum(cell.state == state for cell in self.cells)
 
     @property
     def failed(self) -> tuple[CellStatus, ...]:
-        """The cells that failed."""
         return tuple(cell for cell in self.cells if cell.state == "failed")
 
     @property
@@ -312,7 +310,6 @@ class StudyStatus:
         return counts
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain JSON data."""
         return {
             "folder": str(self.folder),
             "study": self.file.versioned_name,

@@ -313,7 +313,6 @@ def _visit_metrics(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 
 @table("stream_matrices", "")
 def _matrices(analysis: Analysis) -> pd.DataFrame:
-    """The IQM over lives of the retention matrices."""
     rows = analysis.tables["stream_retention"]
     rows = rows.assign(visit=rows.visit.fillna(_INITIAL).astype("int64"))
     of_phases = metrics_of("visit", rows.columns)

@@ -189,7 +189,6 @@ def _missing(analysis: Analysis, part: RunKind) -> pd.DataFrame:
     both=True,
 )
 def _contrasts(analysis: Analysis, part: RunKind) -> Iterator[tuple[Any, ...]]:
-    """What each class changes compared with the first one, between runs of equal number."""
     first, keys = next(iter(part.axes), ""), [metric.key for metric in part.metrics]
     runs = part.runs
     base = runs.loc[runs.class_name == first, ["algorithm", "run", *keys]]
@@ -341,7 +340,6 @@ def layers(probed: pd.DataFrame) -> pd.DataFrame:
 
 @table("agents", f"{PLACE_COLUMNS} agent:str metric:str {INTERVAL}", optional=True)
 def _agents(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    """The IQM of regret of each agent of a team."""
     runs, metrics = analysis.runs, metrics_of("agent")
     keys = [metric.key for metric in metrics]
     names = [c.partition("/")[2] for c in runs.columns if c.startswith(f"{keys[0]}/")]
@@ -362,7 +360,6 @@ def _agents(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     "high",
 )
 def _aggregates(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    """Statistics of 1 − normalised regret over the classes of each group; classes count alike."""
     for group, metric, values in _compared(analysis):
         for algorithm, (name, statistic) in itertools.product(values, STATISTICS.items()):
             classes = {key: x[:, None] for key, x in values[algorithm].items()}
@@ -376,7 +373,6 @@ def _aggregates(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 
 @table("profiles", f"{_GROUP} algorithm:str fewest_runs:int64 threshold share low high")
 def _profiles(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    """Shares of runs whose 1 − normalised regret is above each threshold."""
     bootstrap = analysis.bootstrap
     for group, metric, values in _compared(analysis):
         for algorithm, classes in values.items():

@@ -178,7 +178,6 @@ def _every_file(
     figures: Sequence[Picture],
     tables: Sequence[TextTable],
 ) -> dict[str, str | bytes]:
-    """What only a full report has."""
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
         contents["findings.json"] = to_json(

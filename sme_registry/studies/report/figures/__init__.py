@@ -64,7 +64,6 @@ def draw_figures(analysis: Analysis, formats: Sequence[str]) -> tuple[list[Pictu
 
 
 def draw_contrasts(analysis: Analysis) -> Drawn:
-    """The change that each class makes: of regret, and of metrics of training."""
     general = [metric for metric in metrics_of("run") if not metric.needs]
     for name in ("regret", "training"):
         metrics = [metric for metric in general if metric.training == (name == "training")]
@@ -82,7 +81,6 @@ def draw_contrasts(analysis: Analysis) -> Drawn:
 
 
 def draw_agents(analysis: Analysis) -> Drawn:
-    """Normalised regret of each agent of a team, WD and OOD side by side, one row an agent."""
     rows = analysis.tables["agents"]
     yield from _forest(
         analysis, rows.assign(place=rows.class_name + ", " + rows.agent), "iqm",
@@ -95,7 +93,6 @@ def draw_agents(analysis: Analysis) -> Drawn:
 
 
 def draw_aggregates(analysis: Analysis) -> Drawn:
-    """The IQM of 1 − normalised regret, WD and OOD side by side, one row a group of classes."""
     rows = analysis.tables["aggregates"]
     yield from _forest(
         analysis, rows[rows.statistic == "iqm"], "value", metrics_of("score"),
@@ -109,7 +106,6 @@ def draw_aggregates(analysis: Analysis) -> Drawn:
 
 
 def draw_improvements(analysis: Analysis) -> Drawn:
-    """How probably one algorithm beats another, WD and OOD side by side, one row a pair."""
     rows = analysis.tables["improvements"]
     rows = rows[rows.group == ALL]
     yield from _forest(
@@ -124,7 +120,6 @@ def draw_improvements(analysis: Analysis) -> Drawn:
 
 
 def draw_differences(analysis: Analysis) -> Drawn:
-    """The paired difference of each algorithm from the first one, one row a class."""
     first, rows = analysis.algorithms[0], analysis.tables["differences"]
     rows = rows[rows["first"] == first]
     yield from _forest(
@@ -140,7 +135,6 @@ def draw_differences(analysis: Analysis) -> Drawn:
 
 
 def draw_lives(analysis: Analysis) -> Drawn:
-    """The metrics of whole lives, one panel a metric and one row a stream."""
     rows = analysis.tables["stream_metrics"]
     shown = [metric for metric in metrics_of("life") if metric.key in _OF_LIVES]
     yield from _forest(
@@ -221,7 +215,6 @@ def _places(analysis: Analysis, rows: pd.DataFrame, place: str) -> dict[str, flo
 
 
 def draw_regions(analysis: Analysis) -> Drawn:
-    """Similarity of every algorithm on every class in every region: one heat map an algorithm."""
     rows = analysis.tables["regions"]
     regions = list(dict.fromkeys(rows.region))
     classes = [name for name in analysis.classes if name in set(rows.class_name)]
@@ -254,7 +247,6 @@ def draw_regions(analysis: Analysis) -> Drawn:
 
 
 def draw_decay(analysis: Analysis) -> Drawn:
-    """What each run loses out of distribution, against its similarity within; one mark a run."""
     results = analysis.tables["results"]
     inside, outside = (results.drop_duplicates(RUN, keep=keep) for keep in ("first", "last"))
     loss = outside.similarity_loss.to_numpy()
@@ -283,7 +275,6 @@ def draw_decay(analysis: Analysis) -> Drawn:
 
 
 def draw_maps(analysis: Analysis) -> Drawn:
-    """One map a class and algorithm whose models were kept."""
     inside = analysis.tables["results"][analysis.tables["results"].region == "WD"]
     single = [name for name, info in analysis.classes.items() if info.setting["team"] == "none"]
     plane = inside[(inside.state_dim == 2) & inside.class_name.isin(single)]

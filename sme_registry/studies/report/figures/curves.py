@@ -143,7 +143,6 @@ def _draw_axis(
 
 
 def draw_profiles(analysis: Analysis) -> Drawn:
-    """The share of runs above each value of 1 − normalised regret, one panel a group of classes."""
     looks = looks_of(analysis)
 
     def draw_group(axes: Axes, rows: pd.DataFrame) -> None:
@@ -173,7 +172,6 @@ def draw_profiles(analysis: Analysis) -> Drawn:
 
 
 def draw_class_curves(analysis: Analysis) -> Drawn:
-    """Learning curves with a panel for each class and all algorithms in it."""
     rows = analysis.tables["learning_curves"]
     rows = rows[(rows.measure == "regret") & rows.algorithm.isin(analysis.learners)]
     looks = looks_of(analysis, rows.algorithm)
@@ -191,7 +189,6 @@ def draw_class_curves(analysis: Analysis) -> Drawn:
 
 
 def draw_lifetime_curves(analysis: Analysis) -> Drawn:
-    """Regret per step over the lifetime, evaluated on the task in force, one panel a stream."""
     rows = analysis.tables["stream_learning_curves"]
     rows = rows[rows.measure == "regret"]
     if not rows.empty:
@@ -229,7 +226,6 @@ def _lines_by_class(
 
 
 def draw_learning_curves(analysis: Analysis) -> Drawn:
-    """One figure an axis: a row of panels an algorithm, the values of the axis as lines."""
     for group in _axis_groups(analysis):
         rows = analysis.tables["learning_curves"]
         rows = rows[rows.class_name.isin(group.classes) & rows.algorithm.isin(analysis.learners)]
@@ -266,7 +262,6 @@ def _group_curves(analysis: Analysis, group: Group, rows: pd.DataFrame) -> Figur
 
 
 def draw_offline(analysis: Analysis) -> Drawn:
-    """The improvement of offline learners over the behaviour policy, one panel a class."""
     rows = analysis.tables["offline"]
     if rows.empty:
         return
@@ -318,7 +313,6 @@ def _class_labels(group: Group, *, with_symbol: bool = False) -> list[str]:
 
 
 def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
-    """The dynamic regret over the lifetime, one panel a stream."""
     regret, references = (analysis.tables[f"stream_{n}"] for n in ("regret", "reference_regret"))
     if regret.empty:
         return
@@ -357,7 +351,6 @@ def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
 
 
 def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
-    """The plasticity ratio by visit, one panel a stream."""
     rows = analysis.tables["stream_visit_metrics"]
     rows = rows[(rows.region == WITHIN) & (rows.metric == "plasticity_ratio")]
     if rows.empty:
@@ -386,7 +379,6 @@ def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
 
 
 def draw_retention(analysis: Analysis) -> Iterator[Picture]:
-    """The retention matrices of each stream, one panel an algorithm."""
     matrices = analysis.tables["stream_matrices"]
     for name, rows in panels.by(matrices[matrices.region == WITHIN], "class_name"):
         yield Picture(
@@ -422,7 +414,6 @@ def _retention(rows: pd.DataFrame, visits: Sequence[Visit]) -> Figure:
 
 
 def draw_performance(analysis: Analysis) -> Iterator[Picture]:
-    """Performance on each phase over the visits of each stream, one panel an algorithm."""
     reports: dict[str, dict[str, list[StreamReport]]] = {}
     for life in analysis.lives:
         of_stream = reports.setdefault(life.planned.class_name, {})
