@@ -68,7 +68,6 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "learning": ("Learning", ("learning-curves",)),
     "streams": ("Lives in streams", ("stream-",)),
     "explorers": ("Explorers", ()),
-    "absent": ("Figures that could not be drawn", ()),
     "tables": ("Tables", ()),
     "origin": ("Origin of the numbers", ()),
 }
@@ -136,10 +135,10 @@ def _contents(
     """The contents of each file, by its name in the report."""
     tables = text_tables(analysis)
     figure_formats = [_FIGURE_FORMATS[name] for name in formats if name in _FIGURE_FORMATS]
-    figures, absent = draw_figures(analysis, figure_formats) if figure_formats else ([], [])
+    figures = draw_figures(analysis, figure_formats) if figure_formats else []
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
-        contents["index.html"] = page(analysis, figures, absent, tables, explorers)
+        contents["index.html"] = page(analysis, figures, tables, explorers)
     for ending in ("png", "pdf"):
         if ending in formats and figures:
             contents[f"figure.{ending}"] = _main_figure(analysis, figures).files[ending]
@@ -203,11 +202,9 @@ def _every_file(
 def page(
     analysis: Analysis,
     figures: Sequence[Picture] = (),
-    absent: Sequence[str] = (),
     tables: Sequence[TextTable] = (),
     explorers: Sequence[Explorer] = (),
 ) -> str:
-    """The whole page; `absent` has a sentence for each figure that could not be drawn."""
     rows = findings(analysis)
     by_section = {
         key: [figure for figure in figures if figure.name.startswith(prefixes)]
@@ -215,7 +212,7 @@ def page(
     }
     present = {
         "tables": True, "origin": True, "findings": analysis.classes, "streams": analysis.streams,
-        "offline": "offline" in set(rows.section), "absent": absent, "explorers": explorers,
+        "offline": "offline" in set(rows.section), "explorers": explorers,
     }  # fmt: skip
     offline = [table for table in tables if table.name.startswith("offline")]
     return rendered(
@@ -230,7 +227,6 @@ def page(
         findings=_by_subject(rows),
         figures=by_section,
         tables={"offline": offline, "tables": [t for t in tables if t not in offline]},
-        absent=absent,
         explorers=explorers,
         origin=_origin(analysis),
         missing=pd.concat([analysis.missing(streams=streams) for streams in (False, True)]),
@@ -378,6 +374,6 @@ def write_comparison(
     results = ledger.results(cell.cell.digest for cell in plan.cells)
     both_alone = file.model_copy(update={"plan": plan})
     analysis = analyse(both_alone, results, coloured=file.plan.algorithms)
-    for picture in draw((draw_differences, draw_class_curves), analysis, WRITTEN)[0]:
+    for picture in draw((draw_differences, draw_class_curves), analysis, WRITTEN):
         contents |= {f"{picture.name}.{ending}": picture.files[ending] for ending in WRITTEN}
     return [write_atomically(Path(out) / name, content) for name, content in contents.items()]

@@ -98,5 +98,5 @@ def test_the_report_has_a_table_and_a_figure_of_the_agents(mixed):
     tables = {table.name: table.frame for table in text_tables(analysis)}
     assert list(tables["agents-wd-regret"].agent) == AGENTS
     assert "agents" in csv_tables(analysis)
-    ((picture,), _) = draw([draw_agents], analysis, ("svg",))
+    (picture,) = draw([draw_agents], analysis, ("svg",))
     assert b"team, agent_1" in picture.files["svg"]

@@ -46,7 +46,7 @@ def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(anal
     levels.loc[worst, ["iqm", "low", "high"]] = 1.7, 1.5, 1.9
     names = [f"PPO (learning_rate = 0.000{i}, n_steps = 256)" for i in range(1, 9)]
     many = with_algorithms(with_tables(analysis, levels=levels), names)
-    pictures, _ = draw_figures(many, ())
+    pictures = draw_figures(many, ())
     assert {picture.name for picture in pictures} == FIGURES
     by_name = {picture.name: picture.figure for picture in pictures}
     for name, figure in by_name.items():
@@ -66,7 +66,7 @@ def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysi
         similarity=np.linspace(0.91, 0.96, len(analysis.tables["regions"]))
     )
     coloured = with_tables(analysis, regions=regions)
-    ((picture,), _) = figures.draw([figures.draw_regions], coloured, ())
+    (picture,) = figures.draw([figures.draw_regions], coloured, ())
     figure = picture.figure
     maps = [axes for axes in figure.axes if axes.images]
     assert len(maps) == len(analysis.algorithms)
@@ -78,7 +78,7 @@ def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysi
 
 def test_a_figure_of_levels_shows_those_of_its_own_metric(analysis):
     levels = analysis.tables["levels"]
-    pictures, _ = figures.draw([curves.draw_regret], analysis, ())
+    pictures = figures.draw([curves.draw_regret], analysis, ())
     for picture, metric in zip(pictures, ("wd_regret", "ood_regret"), strict=True):
         lines = [line for axes in picture.figure.axes for line in axes.lines]
         drawn = {float(y) for line in lines for y in line.get_ydata()}
@@ -90,13 +90,13 @@ def test_levels_of_one_state_dimension_are_comparable(analysis):
     results = analysis.tables["results"]
     alike = with_tables(analysis, results=results[results.state_dim == 8])
     for tables, remarked in ((analysis, True), (alike, False)):
-        ((picture,), _) = figures.draw([figures.draw_regions], tables, ())
+        (picture,) = figures.draw([figures.draw_regions], tables, ())
         assert ("not comparable" in picture.caption) == remarked
 
 
 def test_an_axis_with_a_single_class_has_no_figure(finished):
     two = analysed(finished, lambda planned: planned.class_name not in ("default", "k-25"))
-    pictures, _ = figures.draw([curves.draw_learning_curves], two, ())
+    pictures = figures.draw([curves.draw_learning_curves], two, ())
     assert [picture.name for picture in pictures] == ["learning-curves-k"]
 
 
@@ -107,7 +107,7 @@ def test_a_method_has_one_colour_in_every_figure_and_a_legend_explains_hollow_ma
     alone = analyse(file, analysis.cells, coloured=plan.algorithms, draws=10)
     assert looks_of(alone)["Beta"] == looks_of(analysis)["Beta"]
     assert looks_of(alone)["Beta"]["color"] != looks_of(analysis)["Alpha"]["color"]
-    picture = figures.draw((figures.draw_contrasts,), analysis, ())[0][0]
+    picture = figures.draw((figures.draw_contrasts,), analysis, ())[0]
     texts = [text.get_text() for legend in picture.figure.legends for text in legend.get_texts()]
     assert FEW.lower() in texts  # Beta has three pairs on k-25
 

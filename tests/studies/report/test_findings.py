@@ -159,16 +159,16 @@ def test_different_training_steps_are_reported(analysis):
     assert steps.sentence == "Training steps differ: Alpha 4,000, Beta 40."
 
 
-def text_of(analysis, *reasons):
+def text_of(analysis):
     """What a reader sees of the page."""
-    text = page(analysis, absent=reasons)
+    text = page(analysis)
     body = re.sub("</?(code|strong)>", "", text[text.index("<main>") :])
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
 
 
 def assert_worded(analysis):
     """The text of a page without values that are missing and without gaps between words."""
-    text = text_of(analysis, "No maps.")
+    text = text_of(analysis)
     assert not re.search(r"None|nan\b", text)
     assert not re.search(r"\(\s|\s[,.;:)]|\.\.|,,", text)
     assert not re.search(r"\d[a-z]{3}|[a-z½)](?=[0-9A-Z½])", text[: text.index("Tables")])

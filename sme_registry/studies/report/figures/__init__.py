@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -44,20 +44,17 @@ _OF_LIVES = ("average_performance", "forgetting", "plasticity_ratio", "learning_
 
 def draw(
     drawings: Iterable[Callable[[Analysis], Drawn]], analysis: Analysis, formats: Sequence[str]
-) -> tuple[list[Picture], list[str]]:
-    """Pictures with their files, and why others are absent."""
-    pictures, reasons = [], []
+) -> list[Picture]:
+    """Pictures with their files."""
     with style.styled():
-        for drawn in itertools.chain.from_iterable(drawing(analysis) for drawing in drawings):
-            if isinstance(drawn, str):
-                reasons.append(drawn)
-            else:
-                files = style.encoded(drawn.figure, formats)
-                pictures.append(replace(drawn, files=files))
-    return pictures, reasons
+        return [
+            replace(picture, files=style.encoded(picture.figure, formats))
+            for drawing in drawings
+            for picture in drawing(analysis)
+        ]
 
 
-def draw_figures(analysis: Analysis, formats: Sequence[str]) -> tuple[list[Picture], list[str]]:
+def draw_figures(analysis: Analysis, formats: Sequence[str]) -> list[Picture]:
     from_tasks = TASK_FIGURES if analysis.algorithms else ()
     from_streams = STREAM_FIGURES if analysis.lives else ()
     return draw((*from_tasks, *from_streams), analysis, formats)
@@ -278,14 +275,8 @@ def draw_maps(analysis: Analysis) -> Drawn:
     inside = analysis.tables["results"][analysis.tables["results"].region == "WD"]
     single = [name for name, info in analysis.classes.items() if info.setting["team"] == "none"]
     plane = inside[(inside.state_dim == 2) & inside.class_name.isin(single)]
-    if plane.empty:
-        return
-    kept, problem = _kept_maps(analysis, plane[plane.key.isin(analysis.models)])
+    kept = _kept_maps(analysis, plane[plane.key.isin(analysis.models)])
     if not kept:
-        yield (
-            "No maps of the plane: they need trained models. Run the study with --keep-models in a "
-            f"new folder.{problem}"
-        )
         return
     scale = maps.colour_scale([grid for grid, _ in kept.values()])
 
@@ -307,27 +298,23 @@ def draw_maps(analysis: Analysis) -> Drawn:
         "Similarity over the plane, beyond the unit square",
         "r̃ of a trained policy at each state of the plane, halfway through the episode; the square "
         "is the unit square, where it was trained. For each algorithm the run with the median r̃ "
-        f"within distribution, among those whose model was kept.{problem}",
+        "within distribution, among those whose model was kept.",
         figure,
         is_map=True,
     )
 
 
-def _kept_maps(
-    analysis: Analysis, runs: pd.DataFrame
-) -> tuple[dict[tuple[str, str], tuple[Any, float]], str]:
-    """(class, algorithm) → its median run's map and WD similarity; and the last problem."""
-    kept, problem = {}, ""
+def _kept_maps(analysis: Analysis, runs: pd.DataFrame) -> dict[tuple[str, str], tuple[Any, float]]:
+    """(class, algorithm) → its median run's map and WD similarity, if its model can be loaded."""
+    kept = {}
     for place, group in by_place(runs).items():
         median = group.sort_values(["similarity", "run"]).iloc[(len(group) - 1) // 2]
         spec = analysis.cells[median.key].cell.spec
-        try:
+        with contextlib.suppress(SMEError):
             policy = as_policy(analysis.models[median.key], spec)
             _, grid = maps.similarity_on_grid(policy, spec, _EPSILON, _RESOLUTION, _TIME)
             kept[place] = grid, median.similarity
-        except SMEError as error:
-            problem = f" {error}"
-    return kept, problem
+    return kept
 
 
 TASK_FIGURES = (

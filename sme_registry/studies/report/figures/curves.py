@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
@@ -312,7 +312,7 @@ def _class_labels(group: Group, *, with_symbol: bool = False) -> list[str]:
     return labels or list(group.classes)
 
 
-def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
+def draw_dynamic_regret(analysis: Analysis) -> Drawn:
     regret, references = (analysis.tables[f"stream_{n}"] for n in ("regret", "reference_regret"))
     if regret.empty:
         return
@@ -350,7 +350,7 @@ def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
     yield Picture("stream-regret", "Dynamic regret", caption, figure)
 
 
-def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
+def draw_plasticity(analysis: Analysis) -> Drawn:
     rows = analysis.tables["stream_visit_metrics"]
     rows = rows[(rows.region == WITHIN) & (rows.metric == "plasticity_ratio")]
     if rows.empty:
@@ -378,7 +378,7 @@ def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
     )
 
 
-def draw_retention(analysis: Analysis) -> Iterator[Picture]:
+def draw_retention(analysis: Analysis) -> Drawn:
     matrices = analysis.tables["stream_matrices"]
     for name, rows in panels.by(matrices[matrices.region == WITHIN], "class_name"):
         yield Picture(
@@ -413,7 +413,7 @@ def _retention(rows: pd.DataFrame, visits: Sequence[Visit]) -> Figure:
     return figure
 
 
-def draw_performance(analysis: Analysis) -> Iterator[Picture]:
+def draw_performance(analysis: Analysis) -> Drawn:
     reports: dict[str, dict[str, list[StreamReport]]] = {}
     for life in analysis.lives:
         of_stream = reports.setdefault(life.planned.class_name, {})

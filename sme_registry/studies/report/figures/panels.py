@@ -59,8 +59,7 @@ class Picture:
     files: Mapping[str, bytes] = field(default_factory=dict)
 
 
-Drawn = Iterator[Picture | str]
-"""Pictures, or sentences that say why there is none."""
+Drawn = Iterator[Picture]
 
 
 def new_look(colour: Any, marker: str = "", dash: Any = "-") -> Look:
