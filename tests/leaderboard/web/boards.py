@@ -8,7 +8,8 @@ from leaderboard.documents.submission import Submission
 from leaderboard.scoring.ranking import levels_of, never_listed, result_of, run_metrics
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.io import sha256_of
-from sme_registry.spec import EvaluationProtocol, Suite
+from sme_registry.spec import EvaluationProtocol
+from tests.leaderboard.conftest import suite_of
 
 CREATED = "2026-11-21T09:30:00Z"
 HOSTILE = "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>&amp;"
@@ -16,26 +17,16 @@ RTL = "evil\u202egnp.exe"
 VERSIONS = {"sme-registry": "0.1.0", "onnxruntime": "1.24.1", "numpy": "2.4.6"}
 
 
-def suite(classes=3, instances=2):
-    setting = {"state_dim": 2, "action_dim": 1, "k": 1, "r_min": 0.0, "D": 0.0}
-    members = [
-        {
-            "name": f"plane{number}",
-            "setting": {**setting, "complexity": number},
-            "seeds": list(range(1, instances + 1)),
-        }
-        for number in range(1, classes + 1)
-    ]
-    return Suite.from_dict({"classes": members})
-
-
 def create(path, *, classes=3, references=True):
     """A board with its two reference rows."""
+    plain = {"k": 1, "r_min": 0.0, "D": 0.0}
+    numbers = range(1, classes + 1)
+    suite = suite_of(**{f"plane{n}": (2, {**plain, "complexity": n}) for n in numbers})
     store = SeasonStore.create(
         path,
         title="Smoke board",
         suite_name="smoke-v1",
-        suite=suite(classes),
+        suite=suite,
         protocol_name="paper-v1",
         protocol=EvaluationProtocol(),
         draws=200,
