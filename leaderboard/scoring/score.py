@@ -37,12 +37,11 @@ ten layers): PPO, TD3 and SAC of 2,048 to 102,400 steps 0.090, a network after 1
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import secrets
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -88,14 +87,6 @@ def evaluation_seed(protocol_digest: str, spec_digest: str, file_digest: str) ->
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 11
 
 
-@dataclass
-class _Machine:
-    """What scores: recorded in the result, whatever becomes of the submission."""
-
-    isolation: Isolation
-    versions: dict[str, str] = field(default_factory=lambda: versions(["numpy", "onnx"]))
-
-
 def score_submission(
     board: BoardDocument,
     submission: Submission,
@@ -110,10 +101,10 @@ def score_submission(
     `RunScore.actions`, and a rejection if a policy file, or its behaviour, is rejected. A
     `ScoringFault`, of the sandbox or of the machine, judges nothing.
     """
-    machine = _Machine(isolation or available_isolation())
+    scoring = _Scoring(board, submission, policy_file, progress, isolation)
     try:
         unlisted = never_listed(board, submission)
-        runs = _score_runs(board, submission, policy_file, progress, machine)
+        runs = list(map(scoring.run, range(len(submission.runs))))
     except Rejection as error:
         return Result(
             submission=submission.digest,
@@ -122,104 +113,91 @@ def score_submission(
             status="rejected",
             code=error.code,
             message=error.message,
-            versions=machine.versions,
-            isolation=machine.isolation,
+            versions=scoring.versions,
+            isolation=scoring.isolation,
         )
     return result_of(
-        board,
-        submission.digest,
-        runs,
-        machine.versions,
+        *(board, submission.digest, runs, scoring.versions),
         unlisted=unlisted,
-        isolation=machine.isolation,
+        isolation=scoring.isolation,
     )
 
 
-def _score_runs(
-    board: BoardDocument,
-    submission: Submission,
-    policy_file: Callable[[str], bytes],
-    progress: Progress | None,
-    machine: _Machine,
-) -> list[RunScore]:
-    """The listed runs in order."""
-    instances = board.instances
-    states = board.protocol.states_per_region * len(board.protocol.edges)
-    policies = sum(run.artefact is not None for run in submission.runs)
-    behaviours = Behaviours(board.protocol, submission.digest)
-    runs: list[RunScore] = []
-    evaluated = 0
-    for index, run in enumerate(submission.runs):
-        class_name, spec = instances[run.spec]
+class _Scoring:
+    """The scoring of one submission. What scores is recorded, whatever becomes of it."""
+
+    def __init__(
+        self,
+        board: BoardDocument,
+        submission: Submission,
+        policy_file: Callable[[str], bytes],
+        progress: Progress | None,
+        isolation: Isolation | None,
+    ) -> None:
+        self.isolation: Isolation = isolation or available_isolation()
+        self.versions = versions(["numpy", "onnx"])
+        self._board, self._runs, self._instances = board, submission.runs, board.instances
+        self._policy_file, self._progress = policy_file, progress
+        self._behaviours = Behaviours(board.protocol, submission.digest)
+        self._evaluated = 0  # policies
+
+    def run(self, index: int) -> RunScore:
+        """The score of a listed run; in order."""
+        board, run = self._board, self._runs[index]
+        class_name, spec = self._instances[run.spec]
         if run.artefact is None:
-            runs.append(failed_run(board.protocol, class_name, run.spec))
-            continue
-
-        def advanced(done: int, _: int, before: int = states * evaluated) -> None:
-            if progress is not None:
-                progress(before + done, states * policies)
-
+            return failed_run(board.protocol, class_name, run.spec)
         digest = run.artefact.sha256
-        observe = functools.partial(behaviours.observe, f"runs.{index}", spec)
         try:
-            data = policy_file(digest)
-            evaluation = _evaluate(board, spec, data, digest, advanced, machine, observe)
+            report, actions = self._evaluate(f"runs.{index}", spec, digest)
         except Rejection as error:
             raise Rejection(
                 error.code,
                 f"runs.{index} (class {class_name}, spec {run.spec}, policy {digest}): "
                 f"{error.message}",
             ) from None
-        evaluated += 1
-        report, actions = evaluation
-        runs.append(
-            scored_run(
-                report,
-                class_name,
-                digest,
-                board.rules,
-                spec=run.spec,
-                evaluation_seed=report.protocol.seed,
-                actions=actions,
-            )
+        self._evaluated += 1
+        return scored_run(
+            *(report, class_name, digest, board.rules),
+            spec=run.spec,
+            evaluation_seed=report.protocol.seed,
+            actions=actions,
         )
-    return runs
+
+    def _evaluate(
+        self, name: str, spec: SMESpec, digest: str
+    ) -> tuple[EvaluationReport, str | None]:
+        """Evaluate a policy in the sandbox on the states of its own seed; digest its actions."""
+        data, protocol = self._policy_file(digest), self._board.protocol
+        agents, states = max(1, len(agent_names(spec))), protocol.states_per_region
+        rows = states * len(protocol.edges) + COMPARED
+        limits = SandboxLimits.for_policy(len(data), rows, agents)
+        with Sandbox(data, *widths(spec), limits, isolation=self.isolation) as sandbox:
+            self.versions["onnxruntime"] = sandbox.runtime
+            policy = _CheckedPolicy(sandbox, states, agents)
+            seed = evaluation_seed(protocol.digest, spec.digest, digest)
+            own = protocol.model_copy(update={"seed": seed})
+            try:
+                report = evaluate(
+                    policy, spec, own, action_range="unit", name=digest, progress=self._advanced
+                )
+                actions = self._behaviours.observe(name, spec, sandbox)
+            except PolicyError as error:  # as policies wrap the errors of any callable
+                raise error.__cause__ if isinstance(error.__cause__, SMEError) else error from None
+        used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
+        self.versions |= {**used, "onnxruntime": sandbox.runtime}
+        return report, actions
+
+    def _advanced(self, done: int, states: int) -> None:
+        """Report the progress over the states of all policies."""
+        if self._progress is not None:
+            policies = sum(run.artefact is not None for run in self._runs)
+            self._progress(states * self._evaluated + done, states * policies)
 
 
 def agent_names(spec: SMESpec) -> list[str]:
     """The agents of a team, in the order of the channels that they own; none without a team."""
     return [] if spec.team is None else [agent.name for agent in spec.team.agents]
-
-
-def _evaluate(
-    board: BoardDocument,
-    spec: SMESpec,
-    data: bytes,
-    digest: str,
-    progress: Progress,
-    machine: _Machine,
-    observe: Callable[[Sandbox], str | None],
-) -> tuple[EvaluationReport, str | None]:
-    """Evaluate a policy in the sandbox on the states of its own seed; digest its actions."""
-    agents = max(1, len(agent_names(spec)))
-    states = board.protocol.states_per_region
-    rows = states * len(board.protocol.edges) + COMPARED
-    limits = SandboxLimits.for_policy(len(data), rows, agents)
-    with Sandbox(data, *widths(spec), limits, isolation=machine.isolation) as sandbox:
-        machine.versions["onnxruntime"] = sandbox.runtime
-        policy = _CheckedPolicy(sandbox, states, agents)
-        seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
-        protocol = board.protocol.model_copy(update={"seed": seed})
-        try:
-            report = evaluate(
-                policy, spec, protocol, action_range="unit", name=digest, progress=progress
-            )
-            actions = observe(sandbox)
-        except PolicyError as error:  # as policies wrap the errors of any callable
-            raise error.__cause__ if isinstance(error.__cause__, SMEError) else error from None
-    used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
-    machine.versions |= {**used, "onnxruntime": sandbox.runtime}
-    return report, actions
 
 
 class _CheckedPolicy:

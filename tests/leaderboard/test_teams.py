@@ -9,18 +9,20 @@ from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.signed import SigningKey
+from leaderboard.documents.submission import Submission
 from leaderboard.errors import Rejection
 from leaderboard.gate import sandbox
-from leaderboard.gate.isolation import available_isolation
 from leaderboard.gate.networks import optimal_onnx
-from leaderboard.scoring import ranking, score
+from leaderboard.scoring import ranking
+from leaderboard.scoring.score import score_submission
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
 from leaderboard.web.server import write_site
 from sme_registry import EvaluationProtocol
+from sme_registry.io import sha256_of
 from sme_registry.spec import SuiteFile
-from tests.leaderboard.conftest import linear_onnx, suite_of
+from tests.leaderboard.conftest import linear_onnx, plain_submission, suite_of
 
 AGENTS = [
     {"name": "scout_0", "action_dim": 1, "observes": [0]},
@@ -107,9 +109,13 @@ def test_agents_receive_what_they_observe_and_their_rows_are_checked_in_every_re
     monkeypatch.setattr(
         sandbox.Sandbox, "check_rows", lambda self, seen, rows: checked.append(tuple(seen[0, -2:]))
     )
-    machine = score._Machine(available_isolation())
-    data, digest = optimal_onnx(TEAM), "sha256:" + "0" * 64
-    score._evaluate(DOCUMENT, TEAM, data, digest, lambda *_: None, machine, lambda _: "")
+    data = optimal_onnx(TEAM)
+    policy = {"sha256": sha256_of(data), "size": len(data)}
+    runs = [{"spec": spec.digest, "seed": 0, "steps": 1} for spec in SUITE.instances]
+    submission = Submission.from_dict(
+        plain_submission(DOCUMENT, [{**runs[0], "artefact": policy}, *runs[1:]])
+    )
+    assert score_submission(DOCUMENT, submission, lambda _: data).status == "scored"
 
     rows = np.concatenate(seen)
     scout = rows[:, 4] == 1.0
