@@ -12,7 +12,6 @@ from rich.markup import escape
 
 from leaderboard.cli.results import BoardFolder, Json, open_board, ranking_table
 from leaderboard.documents.result import Metric
-from leaderboard.errors import Rejection
 from leaderboard.scoring.ranking import RankedRow
 from leaderboard.seasons.publication import (
     check_published,
@@ -180,11 +179,7 @@ def close(board: BoardFolder, season: SeasonId) -> None:
 
     with _open(board) as store:
         row = store.season_row(season)
-        if store.clock.time < row.closes:
-            raise Rejection(
-                "season_not_closed",
-                f"season={row.id}: closes at {row.closes}, and it is {store.clock.time}.",
-            )
+        store.check_closed(row, store.clock.time)
         table = Table(
             f"What counts in {row.id}",
             {"number": "number", "method": "text", "submitter": "text", "received": "name"},

@@ -148,25 +148,22 @@ def copy_published(season: Season, source: Path, target: Path) -> None:
             )
 
 
-def _check_copy(season: Season, folder: Path) -> None:
-    if folder.is_dir():  # a copy may be without data
-        check_published(season, folder)
-
-
 def files_of_seasons(store: Store) -> Iterator[Files]:
     """The public files of a board's seasons, for `fetch`."""
     assert isinstance(store, SeasonStore)
     for row in store.seasons():
         folder = store.season_folder(row.digest)
-        check = partial(_check_copy, store.season(row.digest), folder / "published")
+        check = partial(check_published, store.season(row.digest), folder / "published")
         yield Files(f"/api/seasons/{row.id}/files", folder, check)
 
 
 def check_published(
     season: Season, folder: str | os.PathLike[str], progress: Progress | None = None
 ) -> None:
-    """Check data sets and challenge states against their digests."""
+    """Check data sets and challenge states against their digests; a copy may be without any."""
     folder = Path(folder)
+    if not folder.is_dir():
+        return
     for done, (hidden, digests) in enumerate(
         zip(season.hidden, season.published, strict=False), start=1
     ):

@@ -111,6 +111,16 @@ class SeasonStore(Store):
             )
         return row
 
+    def season_of_track(self, name: str, track: SealedTrack) -> SeasonRow:
+        row = self.season_row(name)
+        if row.kind != track:
+            raise Rejection(
+                "season_track",
+                f"season={row.id}: its track is {row.kind}: must be {track}. Offline seasons take "
+                "entries, online ones start tickets.",
+            )
+        return row
+
     def season(self, name: str) -> Season:
         return self.objects.document(Season, self.season_row(name).document)
 
@@ -294,13 +304,7 @@ class SeasonStore(Store):
 
     def open_season(self, name: str, track: SealedTrack, key: str, time: str) -> SeasonRow:
         """The season of this id or digest; a `Rejection` unless it is open to a key at a time."""
-        row = self.season_row(name)
-        if row.kind != track:
-            raise Rejection(
-                "season_track",
-                f"season={row.id}: its track is {row.kind}: must be {track}. Offline seasons take "
-                "entries, online ones start tickets.",
-            )
+        row = self.season_of_track(name, track)
         if row.reveal is not None:
             raise _is_revealed(row)
         if time < row.opens:
@@ -402,14 +406,17 @@ class SeasonStore(Store):
             (entry.document, entry.time, entry.subject),
         )
 
-    def _check_over(self, row: SeasonRow, time: str) -> None:
-        """Reject (`season_not_closed`) a reveal while entrants can still play."""
+    def check_closed(self, row: SeasonRow, time: str) -> None:
         if time < row.closes:
             raise Rejection(
                 "season_not_closed",
                 f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
                 "until then.",
             )
+
+    def _check_over(self, row: SeasonRow, time: str) -> None:
+        """Reject (`season_not_closed`) a reveal while entrants can still play."""
+        self.check_closed(row, time)
         running = [each.number for each in self.entrants(row.digest) if each.result is None]
         if row.kind == "sealed-online" and running:
             raise Rejection(

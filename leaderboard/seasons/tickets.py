@@ -59,7 +59,7 @@ class Ticket:
         self._store, self.season, self._master = store, season, master
         self.request = store.request_of(row)
         place = Place(season.id, "", 0, str(row.number), self.request.content.nonce)
-        self._token = master.secret("token", place).hex()
+        self.token = master.secret("token", place).hex()
         self.deadline = deadline(season, row)
         self._closed = row.result is not None
         self.folder = store.ticket_folder(row.track, row.number)
@@ -75,21 +75,12 @@ class Ticket:
             {
                 "season": self.season.id,
                 "ticket": self.number,
-                "token": self._token,
+                "token": self.token,
                 "deadline": self.deadline,
                 "lanes": MAX_LANES,
                 "classes": [member.model_dump(exclude={"data"}) for member in self.season.classes],
             }
         )
-
-    def check_token(self, token: str) -> None:
-        """Raise `Rejection` (`token_wrong`) unless this is the ticket's password."""
-        if not hmac.compare_digest(token.encode(), self._token.encode()):
-            raise Rejection(
-                "token_wrong",
-                f"ticket={self.number}: the token in the header Authorization is not its own. "
-                "Send `Bearer` and the token that the board answered when the ticket started.",
-            )
 
     def is_over(self, now: str) -> bool:
         """Whether nothing can change any more, at a time of the board."""
@@ -238,8 +229,14 @@ class Sessions:
         return StepFormat(MAX_LANES, 1, max(dims)).request_bytes
 
     def open(self, number: int, token: str) -> Ticket:
+        """A ticket, for whoever has its password."""
         ticket = self.ticket(number)
-        ticket.check_token(token)
+        if not hmac.compare_digest(token.encode(), ticket.token.encode()):
+            raise Rejection(
+                "token_wrong",
+                f"ticket={number}: the token in the header Authorization is not its own. "
+                "Send `Bearer` and the token that the board answered when the ticket started.",
+            )
         return ticket
 
     def is_ready(self, number: int, instance: int) -> bool:

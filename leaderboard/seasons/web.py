@@ -344,12 +344,7 @@ class SeasonRoutes:
         found = self._sessions.get(season)
         if found is not None:
             return found
-        row = self._store.season_row(season)
-        if row.kind != "sealed-online":
-            raise Rejection(
-                "season_track",
-                f"season={row.id}: its track is {row.kind}: it takes entries, and has no tickets.",
-            )
+        self._store.season_of_track(season, "sealed-online")
         raise RequestError(
             "season_not_served", f"season={season}: {HTTP_CODES['season_not_served']}."
         )

@@ -279,13 +279,9 @@ class StepFormat:
         return number, actions
 
     def pack_steps(self, steps: StepsAnswer) -> bytes:
-        width = self._width
-        table = np.empty((self.lanes, 2 * width + 2), _FLOAT)
-        table[:, :width] = steps.observation
-        table[:, width] = steps.reward
-        table[:, width + 1] = TERMINATED * steps.terminated + TRUNCATED * steps.truncated
-        table[:, width + 2 :] = steps.last_observation
-        return table.tobytes()
+        ends = TERMINATED * steps.terminated + TRUNCATED * steps.truncated
+        columns = steps.observation, steps.reward, ends, steps.last_observation
+        return _pack(np.column_stack(columns))
 
     def unpack_steps(self, data: bytes) -> StepsAnswer:
         _check_size("steps", data, self.answer_bytes)
