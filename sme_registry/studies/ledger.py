@@ -337,15 +337,6 @@ class StudyStatus:
         }
 
 
-def requested(ledger: Ledger, file: StudyFile) -> set[str]:
-    """Digests of the cells of each class and algorithm of which a run has finished or failed."""
-    ended = ledger.results().keys() | ledger.failures().keys()
-    groups: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for planned in file.plan.cells:
-        groups[planned.class_name, planned.algorithm].add(planned.cell.digest)
-    return {key for keys in groups.values() if keys & ended for key in keys}
-
-
 def study_status(folder: str | os.PathLike[str], only: Sequence[str] = ()) -> StudyStatus:
     """The state of the study in a folder. Changes nothing, and may be called while it runs.
 

@@ -101,10 +101,10 @@ class Analysis:
 
     `cells` and `models` are by the digests of cells, `classes` and `streams` by name, the first one
     first. `places` has a row for each planned cell; its state is `finished`, `failed`, `missing`,
-    or `left out` by `--only`. `algorithms` have a finished run on a single task; `learners` are
-    those of them that learn; `coloured` are all that learn, so that a method has one colour in
-    every figure of a study. `reference_costs` are by class of streams and reference, one for each
-    draw.
+    or `left out` where no run of its class and algorithm has ended. `algorithms` have a finished
+    run on a single task; `learners` are those of them that learn; `coloured` are all that learn,
+    so that a method has one colour in every figure of a study. `reference_costs` are by class of
+    streams and reference, one for each draw.
     """
 
     file: StudyFile
@@ -151,7 +151,6 @@ class Analysis:
         return tasks, RunKind(True, lives, axes, self.stream_algorithms, metrics, "stream_digest")
 
     def missing(self, *, streams: bool) -> pd.DataFrame:
-        """The requested cells that have not finished."""
         places = self.places
         return places[(places.streams == streams) & places.state.isin(["missing", "failed"])]
 
@@ -175,7 +174,7 @@ class Analysis:
 
     @property
     def requested(self) -> int:
-        """How many runs have finished or are missing; `--only` may have left out others."""
+        """How many runs have finished or are missing; others are left out."""
         return self.planned - self._counts["left out"]
 
 

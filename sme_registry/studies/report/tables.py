@@ -117,16 +117,14 @@ def analyse(
     finished: Mapping[str, CellResult],
     errors: Mapping[str, str] | None = None,
     *,
-    requested: Collection[str] = (),
     models: Mapping[str, Path] | None = None,
     coloured: Sequence[StudyAlgorithm] = (),
     draws: int = statistics.DRAWS,
 ) -> Analysis:
     """Every table of a study; equal for equal results.
 
-    Results, errors and models are by the digests of their cells. Of those `requested`, by default
-    all, runs without a result are missing. Colours go to the algorithms that are `coloured`, by
-    default the plan's, in order.
+    Results, errors and models are by the digests of their cells. Colours go to the algorithms that
+    are `coloured`, by default the plan's, in order.
     """
     plan = file.plan
     results, curves = study_frames(plan, finished)
@@ -136,7 +134,7 @@ def analyse(
     classes = class_infos(plan)
     present = [a for a in plan.algorithms if a.name in set(runs.algorithm)]
     names = tuple(algorithm.name for algorithm in present)
-    places = _places(plan, finished, errors or {}, requested)
+    places = _places(plan, finished, errors or {})
     analysis = Analysis(
         file=file,
         cells={key: finished[key] for key in places.key if key in finished},
@@ -158,17 +156,13 @@ def analyse(
     return with_tables(analysis)
 
 
-def _places(
-    plan: StudyPlan,
-    finished: Collection[str],
-    errors: Mapping[str, str],
-    requested: Collection[str],
-) -> pd.DataFrame:
+def _places(plan: StudyPlan, finished: Collection[str], errors: Mapping[str, str]) -> pd.DataFrame:
     """Every planned cell, in the order of the plan."""
     rows = [(*place(c).values(), c.phase, c.in_stream, label(c), c.cell.digest) for c in plan.cells]
     places = frame(rows, RUN_COLUMNS + "phase:Int64 streams:bool label:str key:str")
-    known = [places.key.isin([*keys]) for keys in (finished, errors, requested or places.key)]
-    states = np.select(known, ["finished", "failed", "missing"], "left out")
+    done, failed = (places.key.isin([*keys]) for keys in (finished, errors))
+    begun = (done | failed).groupby([places.class_name, places.algorithm]).transform("any")
+    states = np.select([done, failed, begun], ["finished", "failed", "missing"], "left out")
     return places.assign(state=states, error=[errors.get(key, "") for key in places.key])
 
 

@@ -35,7 +35,7 @@ from sme_registry.io import check_writable, choice, to_json, write_atomically
 from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
 from sme_registry.plots.style import WRITTEN
-from sme_registry.studies.ledger import REPORT, Ledger, requested
+from sme_registry.studies.ledger import REPORT, Ledger
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.design import metrics_of
 from sme_registry.studies.report.figures import (
@@ -123,7 +123,7 @@ def write_report(
     check_writable(target / "index.html")
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
-    analysis = analyse(file, results, failures, requested=requested(ledger, file), models=models)
+    analysis = analyse(file, results, failures, models=models)
     pages = explorers_of(ledger.folder, analysis) if explorers else []
     contents = _contents(analysis, formats, pages, full=full)
     return [write_atomically(target / name, content) for name, content in contents.items()]

@@ -190,7 +190,6 @@ def test_without_results_the_tables_are_empty_and_without_the_first_class_the_co
     assert cut.tables["contrasts"].empty
     assert len(cut.runs) == 73 - 15
     empty = analyse(study[0], {}, draws=50)
-    assert len(empty.tables["missing"]) == 75
     assert empty.tables["results"].empty
     for name in TABLES:
         assert empty.tables[name].empty
