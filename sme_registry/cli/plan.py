@@ -281,7 +281,7 @@ def plan(
     if cores is not None:
         workers[f"a cluster, {cores} cores"] = cores
     done = len(cells) - len(waiting)
-    measured = {cell.uses for cell in waiting if estimator.knows(cell)}
+    measured = {cell.uses for cell in waiting} & {r.cell.uses for r in results.values()}
     if json:
         print_json(
             {

@@ -20,7 +20,6 @@ from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
 from sme_registry.io.terminal import (
     duration,
-    err,
     out,
     print_json,
     print_line,
@@ -124,7 +123,6 @@ def run(
         only=only or (),
         device=device,
         lanes=lanes,
-        console=err(),
     )
     print_status(status, json)
     check_complete(status)
@@ -344,7 +342,7 @@ def sweep(
     plan = options.plan("the options")
     name = re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)[:64] or "sweep"
     file = StudyFile(name=name, digest=plan.digest, plan=plan)
-    status = run_study(file, folder, jobs=jobs, console=err())
+    status = run_study(file, folder, jobs=jobs)
     _print_report(studies.write_report(folder))
     check_complete(status)
 

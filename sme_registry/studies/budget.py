@@ -53,10 +53,6 @@ class Estimator:
             ratios[result.cell.uses].append(result.timing.total / _by_table(result.cell))
         self._ratios = {uses: statistics.median(of_cells) for uses, of_cells in ratios.items()}
 
-    def knows(self, cell: Cell) -> bool:
-        """Whether a cell of the same algorithm has finished."""
-        return cell.uses in self._ratios
-
     def seconds(self, cell: Cell) -> float:
         return _by_table(cell) * self._ratios.get(cell.uses, 1.0)
 

@@ -105,7 +105,6 @@ class TestEstimate:
             update={"timing": result.timing.model_copy(update={"total": 60.0})}
         )
         estimator = Estimator([slow])
-        assert estimator.knows(many)
         assert estimator.seconds(many) == pytest.approx(60.0)
         assert estimator.seconds(ABLATIONS.plan.cells[0].cell) == Estimator().seconds(
             ABLATIONS.plan.cells[0].cell
