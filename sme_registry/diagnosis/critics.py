@@ -363,12 +363,12 @@ class _Levels(NamedTuple):
     @classmethod
     def of(cls, task: Task, learnt: _Critic, at: _Points, tail: float | None, seed: int) -> _Levels:
         mode = learnt.mode(at.observation)
-        returns = expected_returns(
+        finite, left = expected_returns(
             task, learnt, at.s, t=at.t, gamma=learnt.gamma, seed=seed,
             r_cum=at.r_cum, distractors=at.d, actions=mode,
         )  # fmt: skip
-        continuing = None if tail is None else returns.finite + returns.left * tail
-        return cls(learnt.claim(at.observation, mode), returns.finite, continuing)
+        continuing = None if tail is None else finite + left * tail
+        return cls(learnt.claim(at.observation, mode), finite, continuing)
 
 
 def _region(

@@ -47,7 +47,7 @@ from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.spec.suite import ProtocolLike
 from sme_registry.task import Task, load, materialize
 from sme_registry.task.draw import Array
-from sme_registry.task.engine import Engine, engine, network
+from sme_registry.task.engine import chosen_backend, engine, network
 
 WHOLE = ""
 """The scope of all action channels, among the agents' names."""
@@ -179,8 +179,8 @@ def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
     return catalogue.find(ProtocolFile, path).protocol
 
 
-def versions_behind(oracle: Engine) -> dict[str, str]:
-    numba = ["numba"] if oracle.backend == "numba" else []
+def versions_behind() -> dict[str, str]:
+    numba = ["numba"] if chosen_backend() == "numba" else []
     return versions(["numpy", "scipy", "gymnasium", *numba], if_imported=_POLICY_LIBRARIES)
 
 
@@ -273,7 +273,7 @@ class Measurement:
             agents=by_agent,
             safety=self._safety_report(index),
             observation=observation,
-            versions=versions_behind(self._oracle),
+            versions=versions_behind(),
         )
 
     def _begin(self, region: int) -> _Region:

@@ -45,7 +45,7 @@ from sme_registry.evaluation.regions import (
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.task.draw import Array
-from sme_registry.task.engine import Engine, engine
+from sme_registry.task.engine import engine
 from sme_registry.task.loading import materialize_together
 
 _Optional = TupleOf[Real | None]
@@ -261,14 +261,6 @@ class Actor(NamedTuple):
     where: str  # what an error calls it, such as "policies[2]"
 
 
-class StreamRegrets(NamedTuple):
-    """Normalised regret in every region."""
-
-    actors: Array  # `[N, P, K]`, NaN on the phases on which an actor is not measured
-    optima: Array  # `[P, P, K]` of the optimum of each phase
-    oracle: Engine
-
-
 def final_specs(stream: StreamSpec) -> tuple[SMESpec, ...]:
     """The task of each phase at its end: of a drifting one the last."""
     return tuple({segment.phase: segment.spec for segment in stream.segments}.values())
@@ -279,8 +271,11 @@ def stream_regrets(
     actors: Sequence[Actor],
     protocol: EvaluationProtocol,
     progress: OnBatch | None = None,
-) -> StreamRegrets:
-    """Measure each actor on each of its phases, and the optima of all phases."""
+) -> tuple[Array, Array]:
+    """Normalised regret of each actor, and of the optimum of each phase, on the phases' tasks.
+
+    `[N, P, K]`, NaN on the phases on which an actor is not measured, and `[P, P, K]`.
+    """
     specs = final_specs(stream)
     tasks = materialize_together(specs)
     keys = [same_draw(spec) for spec in specs]
@@ -308,7 +303,7 @@ def stream_regrets(
             count += len(batch)
             if progress is not None:
                 progress(count, total)
-    return StreamRegrets(errors / half, of_optima / half, oracles[keys[0]])
+    return errors / half, of_optima / half
 
 
 def _actions(actor: Actor, batch: Observations, stream: StreamSpec) -> Iterator[tuple[int, Array]]:

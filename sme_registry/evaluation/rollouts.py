@@ -112,13 +112,15 @@ def rollouts(
     actions: Array | None = None,
     gamma: float = 1.0,
     seed: int = 0,
+    at_end: bool = False,
 ) -> Rollouts:
     """Run an episode from each of the states `[n, S]` to its end.
 
     After `t` `[n]` steps and with `r_cum` `[n]`, by default at the start; the first actions are
     `actions` `[n, A]`, by default the policy's. `seed` is of distractors that are not given, and of
     noise: episodes from equal states have equal ones. What a policy has as `bonus` `[n]` after a
-    call, such as SAC's −α log π, is added to that step of the discounted return.
+    call, such as SAC's −α log π, is added to that step of the discounted return. `at_end`, a single
+    agent always sees t/T = 1.
     """
     if not isinstance(policy, TeamPolicy):
         task = single_agent(task)
@@ -135,7 +137,7 @@ def rollouts(
         seen = None if distractors is None else distractors[rows]
         batch.place(states[rows], t[rows], np.repeat(r_cum[rows, None], agents, axis=1), seen)
         first = None if actions is None else actions[rows]
-        totals[:, rows] = _sums(batch, _Acting(policy, first), gamma)
+        totals[:, rows] = _sums(batch, _Acting(policy, first, at_end), gamma)
     returns, discounted, length = totals[:3]
     regret, similarity, square, *of_agents = totals[3:] / length
     return Rollouts(returns, discounted, length, regret, similarity, square, np.array(of_agents))
@@ -157,16 +159,21 @@ def _sums(batch: Batch, act: _Acting, gamma: float) -> Array:
 class _Acting:
     """A policy at the start of a batch of episodes, which takes the `first` actions, if any."""
 
-    def __init__(self, policy: Callable[[Observation], Any], first: Array | None) -> None:
+    def __init__(
+        self, policy: Callable[[Observation], Any], first: Array | None, at_end: bool
+    ) -> None:
         self._policy = policy.start() if isinstance(policy, Policy | TeamPolicy) else policy
-        self._first = first
+        self._first, self._at_end = first, at_end
         self.bonus: Any = 0.0
 
     def __call__(self, state: Array, observation: Observation) -> npt.NDArray[Any]:
         action, self._first = self._first, None
         if action is not None:
             return action
-        action = np.asarray(self._policy(observation.copy()))
+        seen = observation.copy()
+        if self._at_end:
+            seen[:, -2] = 1.0
+        action = np.asarray(self._policy(seen))
         self.bonus = getattr(self._policy, "bonus", 0.0)
         return action
 
@@ -234,20 +241,13 @@ def values(
     if policy == "optimal" and first is None and horizon == "finite" and _has_formula(spec, gamma):
         return _of_optimum(task, s, steps, gamma)
     acting = as_policy(policy, spec)
-    returns = expected_returns(
+    finite, left = expected_returns(
         task, acting, s, t=steps, gamma=gamma, samples=samples, seed=seed,
         r_cum=r_cum, distractors=d, actions=first,
     )  # fmt: skip
     if horizon == "finite":
-        return returns.finite
-    return returns.finite + returns.left * value_after_end(task, acting, gamma, seed)
-
-
-class Returns(NamedTuple):
-    """Mean returns `[B]` to the end of the episode, and the discount there."""
-
-    finite: Array
-    left: Array  # γ^(T − t), 0 of episodes that D ends before
+        return finite
+    return finite + left * value_after_end(task, acting, gamma, seed)
 
 
 def expected_returns(
@@ -259,15 +259,19 @@ def expected_returns(
     gamma: float,
     samples: int = 1,
     seed: int = 0,
-    **begun: Array | None,
-) -> Returns:
-    """`values` of checked arguments; `begun` are r_cum, distractors and first actions."""
+    **begun: Any,
+) -> tuple[Array, Array]:
+    """`values` of checked arguments to the end of the episode `[B]`, and the discount there.
+
+    The discount γ^(T − t) is 0 of episodes that D ends before. `begun` are r_cum, distractors and
+    first actions.
+    """
     finite, left, steps = [], [], task.spec.horizon - t
     for i in range(samples):
         runs = rollouts(policy, task, s, t=t, gamma=gamma, seed=seed + i, **begun)
         finite.append(runs.discounted_return)
         left.append(np.where(runs.length < steps, 0.0, gamma**steps))
-    return Returns(np.mean(finite, axis=0), np.mean(left, axis=0))
+    return np.mean(finite, axis=0), np.mean(left, axis=0)
 
 
 def _has_formula(spec: SMESpec, gamma: float) -> bool:
@@ -290,25 +294,8 @@ def value_after_end(
     # Neither changes what is drawn, only how long an episode is, and that P = 0.
     spec = task.spec.derive(horizon=steps, shaping=None)
     s = draw.uniform(seed, "values/tail", _TAILS * spec.state_dim).reshape(_TAILS, -1)
-    at_end = _AtEnd(policy, spec.state_dim + spec.distractors)
-    tail = rollouts(at_end, load_task(spec), s, gamma=gamma, seed=seed)
+    tail = rollouts(policy, load_task(spec), s, gamma=gamma, seed=seed, at_end=True)
     return float(tail.discounted_return.mean() / (1 - gamma**steps))
-
-
-class _AtEnd:
-    """A policy that always sees t/T = 1."""
-
-    def __init__(self, policy: Callable[[Observation], Any], of_t: int) -> None:
-        self._policy = policy.start() if isinstance(policy, Policy) else policy
-        self._of_t = of_t
-
-    def __call__(self, observations: Observation) -> Any:
-        observations[:, self._of_t] = 1.0
-        return self._policy(observations)
-
-    @property
-    def bonus(self) -> Any:
-        return getattr(self._policy, "bonus", 0.0)
 
 
 def numbers_in(

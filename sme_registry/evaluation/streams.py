@@ -309,7 +309,7 @@ def evaluate_stream(
     before = None if initial is None else add(initial, "initial")
     alone = [add(policy, f"fresh[{j}]", [j]) for j, policy in enumerate(fresh or ())]
 
-    regrets, optima, oracle = stream_regrets(stream, actors, protocol, progress)
+    regrets, optima = stream_regrets(stream, actors, protocol, progress)
     *regions, ood = stream_regions(
         protocol,
         regrets[life],
@@ -336,7 +336,7 @@ def evaluate_stream(
         ),
         regions=tuple(regions),
         ood=ood,
-        versions=versions_behind(oracle),
+        versions=versions_behind(),
     )
     return report._with_plasticity(regrets[alone, range(P)]) if alone else report
 
