@@ -178,9 +178,8 @@ def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
         out().print("No submission is waiting.")
         return
     with Progress("scoring", waiting, console=err(), unit="submissions") as progress:
-        run_scorers(
-            board, workers, progress=progress.update_of, isolation=isolation, work=Work(board=Board)
-        )
+        work = Work(isolation=isolation, board=Board)
+        run_scorers(board, workers, progress=progress.update_of, work=work)
     with Board.open(board) as store:
         entries = store.entries()
     counts = Counter(entry.status for entry in entries if entry.id not in before)

@@ -54,6 +54,7 @@ class Work:
 
     submissions: bool = True
     job: Job | None = None
+    isolation: Isolation | None = None  # of policies; by default what the machine has
     board: type[Store] = Store  # one with further tracks needs their class
 
 
@@ -69,7 +70,6 @@ def run_scorer(
     until_empty: bool = True,
     stop: Callable[[], bool] | None = None,
     retry: bool = True,
-    isolation: Isolation | None = None,
     work: Work = Work(),  # frozen
 ) -> int:
     """Score in this process, one submission after another; returns the number of results.
@@ -97,7 +97,7 @@ def run_scorer(
                 if claim.is_job and work.job is not None:
                     _do(store, claim, work.job)
                 else:
-                    result = _score(store, claim, isolation)
+                    result = _score(store, claim, work.isolation)
                     written += result is not None and _finish(store, claim, result, patience, stop)
     return written
 
@@ -175,10 +175,7 @@ def _heartbeats(store: Store, claim: Claim) -> AbstractContextManager[None]:
 
 
 def background_scorers(
-    path: str | Path,
-    workers: int,
-    isolation: Isolation | None = None,
-    work: Work = Work(),  # frozen
+    path: str | Path, workers: int, work: Work = Work()
 ) -> AbstractContextManager[None]:
     """Run scorer processes while the block runs, watched by a thread.
 
@@ -194,14 +191,8 @@ def background_scorers(
         while not stop.is_set():
             begun = time.monotonic()
             try:
-                run_scorers(
-                    path,
-                    max(workers, 1),
-                    until_empty=False,
-                    stop=stop.is_set,
-                    isolation=isolation,
-                    work=work,
-                )
+                processes = max(workers, 1)
+                run_scorers(path, processes, until_empty=False, stop=stop.is_set, work=work)
             except Exception as error:
                 if time.monotonic() - begun > _LONGEST_PAUSE:
                     pause = _FIRST_PAUSE
@@ -220,7 +211,6 @@ def run_scorers(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
     started: Callable[[int], None] | None = None,
-    isolation: Isolation | None = None,
     work: Work = Work(),  # frozen
 ) -> int:
     """Score in several processes at once; one that dies is replaced and its submission rescored.
@@ -230,7 +220,7 @@ def run_scorers(
     """
     integer_in("workers", workers, 1, advice="Leave it out for one.")
     with work.board.open(path) as store:
-        scorers = _Scorers(path, store, workers, (until_empty, isolation, work))
+        scorers = _Scorers(path, store, workers, (until_empty, work))
         before = store.queue.count("done")
         store.queue.retry()
 
@@ -270,7 +260,7 @@ class _Scorers:
         path: str | Path,
         store: Store,
         workers: int,
-        options: tuple[bool, Isolation | None, Work],
+        options: tuple[bool, Work],
     ) -> None:
         self._path, self._store, self._workers = path, store, workers
         self._options, self._until_empty = options, options[0]
@@ -366,7 +356,6 @@ def _scorer_process(
     worker: str,
     errors: Connection,
     until_empty: bool,
-    isolation: Isolation | None,
     work: Work,
 ) -> None:
     # A terminal sends Ctrl-C to parent and children, and the parent passes it on: the second one
@@ -386,7 +375,6 @@ def _scorer_process(
             until_empty=until_empty,
             stop=lambda: parent is not None and not parent.is_alive(),
             retry=False,
-            isolation=isolation,
             work=work,
         )
     except KeyboardInterrupt:

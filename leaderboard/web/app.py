@@ -90,10 +90,9 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         with store, contextlib.ExitStack() as stack:
             store.note_clock()
-            work = Work(job=next((track.job for track in tracks), None), board=_Board)
-            stack.enter_context(
-                background_scorers(store.folder.path, score_workers, isolation, work)
-            )
+            job = next((track.job for track in tracks), None)
+            work = Work(job=job, isolation=isolation, board=_Board)
+            stack.enter_context(background_scorers(store.folder.path, score_workers, work))
             for track in tracks:
                 stack.enter_context(track.open())
             yield

@@ -82,9 +82,9 @@ def _home(tmp_path, monkeypatch):
     furnish(tmp_path)
 
 
-def scored_here(board, workers, *, isolation, work, progress):
+def scored_here(board, workers, *, work, progress):
     """Without processes, each of which takes seconds to start; `scored_folder` has them."""
-    run_scorer(board, isolation=isolation, work=work)
+    run_scorer(board, work=work)
 
 
 @pytest.fixture(scope="module")

@@ -240,7 +240,7 @@ def test_a_served_board_scores_on_after_any_error(tmp_path, monkeypatch, caplog)
     errors = [OSError("no process"), BoardError("full"), MemoryError()]
     scoring, calls = threading.Event(), []
 
-    def run_scorers(path, workers, *, until_empty, stop, isolation, work):
+    def run_scorers(path, workers, *, until_empty, stop, work):
         if errors:
             raise errors.pop()
         calls.append((path, workers, until_empty))
