@@ -33,7 +33,7 @@ _OnEvaluation = Callable[[int, int, Evaluation], Any]
 _OnVisit = Callable[[int, list[dict[str, Array]]], Any]
 
 
-def hyperparameters_of(uses: str, field: str = "uses") -> type[AgentSettings]:
+def hyperparameters_of(uses: str) -> type[AgentSettings]:
     """The model of an algorithm's hyperparameters."""
     model: type[AgentSettings] = _algorithm(uses)[0]
     return model

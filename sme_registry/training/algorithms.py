@@ -148,16 +148,16 @@ class Entry:
     def uses(self) -> str:
         return self.name if self.kind == "sb3" else f"{self.kind}:{self.name}"
 
-    def settings(self, field: str = "uses") -> type[StrictModel]:
+    def settings(self) -> type[StrictModel]:
         """The model of its hyperparameters; raises if it is not installed here."""
-        model: type[StrictModel] = imported(self.backend.settings)(self.name, field)
+        model: type[StrictModel] = imported(self.backend.settings)(self.name)
         return model
 
     def learner(self, run: Run) -> Learner:
         """What learns in this run."""
         if not self.backend.learner:
             raise OptionError(
-                f"{run.field}={self.uses!r}: learns in no environment. Use it in a study."
+                f"algorithm={self.uses!r}: learns in no environment. Use it in a study."
             )
         learner: Learner = imported(self.backend.learner)(self.name, run)
         return learner
@@ -170,8 +170,8 @@ class Entry:
         if kind not in backend.learns:
             known = " or ".join(_KINDS[each] for each in backend.learns)
             raise SpecError(
-                f"uses={self.uses!r}: learns {known}, and this is {_KINDS[kind]}. Choose another "
-                "algorithm, such as PPO."
+                f"algorithm={self.uses!r}: learns {known}, and this is {_KINDS[kind]}. Choose "
+                "another algorithm, such as PPO."
             )
         if _PLACES.get(self.name) == "sme_registry.sb3":
             check_has_limits(self.name, spec)
@@ -207,7 +207,7 @@ def backend_of(uses: str) -> Backend:
     return BACKENDS[parse_uses(uses)[0]]
 
 
-def find(uses: str, field: str = "uses") -> Entry:
+def find(uses: str, field: str = "algorithm") -> Entry:
     """The entry of a name, in any case."""
     kind, name = parse_uses(uses)
     known = {"sb3": _PLACES, "independent": _PLACES}.get(kind, BACKENDS[kind].names)
@@ -231,7 +231,7 @@ def default_algorithm(document: SMESpec | StreamSpec) -> str:
 
 def full_name(uses: str, agents: str | None = None) -> str:
     """The exact name of an algorithm in any case, in the implementation of `agents`, if given."""
-    return find(uses if agents is None else with_agents(uses, agents), "algorithm").uses
+    return find(uses if agents is None else with_agents(uses, agents)).uses
 
 
 def with_agents(uses: str, agents: str) -> str:
@@ -310,40 +310,40 @@ def check_algorithm(algorithm: StudyAlgorithm, planned: Iterable[PlannedCell]) -
     check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
 
 
-def load_algorithm(name: str, field: str = "uses") -> Any:
+def load_algorithm(name: str) -> Any:
     """A class of Stable-Baselines3's kind, or a function that returns a model."""
     require_sb3()  # every model gets its `VecEnv`
     with quiet():
         if name in _PLACES:
             # It imports the deprecated `gym` if that is installed, which prints a long notice.
             with contextlib.redirect_stderr(io.StringIO()):
-                return import_object(f"{_PLACES[name]}:{name}", field, OptionError)
+                return import_object(f"{_PLACES[name]}:{name}", "algorithm", OptionError)
         if ":" not in name:
-            return _entry_point(name, field)
-        algorithm = import_object(name, field, OptionError)
+            return _entry_point(name)
+        algorithm = import_object(name, "algorithm", OptionError)
     if not callable(algorithm):
         raise OptionError(
-            f"{field}={name!r}: is of type {type(algorithm).__name__}: must be a class like those "
-            "of Stable-Baselines3, or a function from an environment to a learner."
+            f"algorithm={name!r}: is of type {type(algorithm).__name__}: must be a class like "
+            "those of Stable-Baselines3, or a function from an environment to a learner."
         )
     return algorithm
 
 
-def _entry_point(name: str, field: str) -> Any:
+def _entry_point(name: str) -> Any:
     installed = {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
     if name not in installed:
         prefixed = [f"{kind}:{one}" for kind, row in BACKENDS.items() for one in row.names]
         known = [*_PLACES, *prefixed, *sorted(installed)]
         raise UnknownNameError(
-            f"{field}={name!r}: must be one of {', '.join(known)}; or module:Class or "
+            f"algorithm={name!r}: must be one of {', '.join(known)}; or module:Class or "
             f"module:function, such as sb3_contrib:TQC.{did_you_mean(name, known)}"
         )
-    return import_object(installed[name].value, f"{field}={name!r}: entry point", OptionError)
+    return import_object(installed[name].value, f"algorithm={name!r}: entry point", OptionError)
 
 
-def sb3_settings(name: str, field: str) -> type[StrictModel]:
+def sb3_settings(name: str) -> type[StrictModel]:
     """The arguments of an algorithm's constructor, or of a function that returns a model."""
-    algorithm = load_algorithm(name, field)
+    algorithm = load_algorithm(name)
     if not (isinstance(algorithm, type) and is_sb3(algorithm)):
         return arguments_of(algorithm, "seed", passed=1)
     aliases: dict[str, Any] = getattr(algorithm, "policy_aliases")  # noqa: B009
@@ -352,17 +352,17 @@ def sb3_settings(name: str, field: str) -> type[StrictModel]:
     return create_model(name, __base__=model, policy_kwargs=(in_policy, None))
 
 
-def independent_settings(name: str, field: str) -> type[StrictModel]:
-    if not is_on_policy(load_algorithm(name, field)):
+def independent_settings(name: str) -> type[StrictModel]:
+    if not is_on_policy(load_algorithm(name)):
         raise OptionError(
-            f"{field}='independent:{name}': must be an on-policy algorithm, such as "
+            f"algorithm='independent:{name}': must be an on-policy algorithm, such as "
             "independent:PPO, because the models of a team learn from the same rollouts. Use one "
             f"model for all agents instead: {name}."
         )
-    return sb3_settings(name, field)
+    return sb3_settings(name)
 
 
-def offline_settings(name: str, field: str) -> type[StrictModel]:
+def offline_settings(name: str) -> type[StrictModel]:
     """The hyperparameters of an offline learner, and its data set's."""
     return create_model(
         name,
@@ -373,7 +373,7 @@ def offline_settings(name: str, field: str) -> type[StrictModel]:
     )
 
 
-def no_settings(name: str, field: str) -> type[StrictModel]:
+def no_settings(name: str) -> type[StrictModel]:
     return StrictModel
 
 

@@ -13,7 +13,6 @@ often as it likes, is evaluated during training too; the last policy is that of 
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import inspect
 import sys
@@ -28,7 +27,7 @@ from sme_registry.envs import SMEEnv
 from sme_registry.envs.episodes import info_of_envs
 from sme_registry.errors import OptionError, PolicyError, did_you_mean
 from sme_registry.evaluation.models import saved_sb3
-from sme_registry.io import write_atomically
+from sme_registry.io import sha256_of, write_atomically
 from sme_registry.io.system import module_file, working_directory_importable
 from sme_registry.spec.document import StrictModel
 from sme_registry.training.algorithms import arguments_of, parse_uses
@@ -38,15 +37,15 @@ _loaded: dict[str, str] = {}  # the digest of the source that a module has run
 _in_memory: dict[str, Callable[..., Any]] = {}  # functions of a notebook, by their names
 
 
-def settings(name: str, field: str) -> type[StrictModel]:
+def settings(name: str) -> type[StrictModel]:
     """The arguments of a function, without the environment, steps and seed."""
-    return arguments_of(load_function(name, field)[0], passed=3)
+    return arguments_of(load_function(name)[0], passed=3)
 
 
-def source_of(uses: str, field: str = "uses") -> str | None:
+def source_of(uses: str) -> str | None:
     """The digest of the source of `train:module:name`, which is not imported; None of any other."""
     kind, name = parse_uses(uses)
-    return _source(name, field)[1] if kind == "train" else None
+    return sha256_of(_source(name)[1]) if kind == "train" else None
 
 
 def keep_in_memory(function: Callable[..., Any]) -> str:
@@ -71,27 +70,28 @@ def is_in_memory(uses: str) -> bool:
 
 
 def check_signature(
-    name: str, function: Callable[..., Any], hyperparameters: Mapping[str, Any], field: str = "uses"
+    name: str, function: Callable[..., Any], hyperparameters: Mapping[str, Any]
 ) -> None:
     """Check that a function can be called with an environment, steps, a seed and these."""
     try:
         inspect.signature(function).bind(None, 1, 0, **hyperparameters)
     except TypeError as error:
         raise OptionError(
-            f"{field}='train:{name}': cannot be called with an environment, steps, a seed and the "
-            f"hyperparameters {sorted(hyperparameters)}: {error}. Define "
+            f"algorithm='train:{name}': cannot be called with an environment, steps, a seed and "
+            f"the hyperparameters {sorted(hyperparameters)}: {error}. Define "
             f"{name.partition(':')[2]}(env, steps, seed), and hyperparameters by name."
         ) from None
 
 
-def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
+def load_function(name: str) -> tuple[Callable[..., Any], str]:
     """The function `module:function` of the present source, and the source's digest.
 
     The source is run again where it has changed, so what runs is what the digest says.
     """
     module_name, _, attribute = name.partition(":")
     with working_directory_importable():
-        path, digest, source = _source(name, field)
+        path, source = _source(name)
+        digest = sha256_of(source)
         if name in _in_memory:
             return _in_memory[name], digest
         module = sys.modules.get(module_name)
@@ -106,36 +106,32 @@ def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], s
         except Exception as error:
             sys.modules.pop(module_name, None)
             raise OptionError(
-                f"{field}='train:{name}': {module_name} cannot be imported: "
+                f"algorithm='train:{name}': {module_name} cannot be imported: "
                 f"{type(error).__name__}: {error}. Correct it."
             ) from error
     function = getattr(module, attribute, None)
     if not callable(function):
         functions = [known for known, value in vars(module).items() if callable(value)]
         raise OptionError(
-            f"{field}='train:{name}': {path} has no function {attribute!r}."
+            f"algorithm='train:{name}': {path} has no function {attribute!r}."
             f"{did_you_mean(attribute, functions)} Define {attribute}(env, steps, seed), which "
             "returns a policy."
         )
     return function, digest
 
 
-def _source(name: str, field: str) -> tuple[str, str, bytes]:
-    """The path, the digest and the bytes of a module's source, which is not imported."""
+def _source(name: str) -> tuple[str, bytes]:
+    """The path and the bytes of a module's source, which is not imported."""
     module = name.partition(":")[0]
     if name in _in_memory:
-        return module, *_digested(inspect.getsource(_in_memory[name]).encode())
+        return module, inspect.getsource(_in_memory[name]).encode()
     path = module_file(module)
     if not path or not path.endswith(".py"):
         raise OptionError(
-            f"{field}='train:{name}': there is no Python module {module!r}. It must be "
+            f"algorithm='train:{name}': there is no Python module {module!r}. It must be "
             "train:module:function, with the module in the working directory or installed."
         )
-    return path, *_digested(Path(path).read_bytes())
-
-
-def _digested(source: bytes) -> tuple[str, bytes]:
-    return f"sha256:{hashlib.sha256(source).hexdigest()}", source
+    return path, Path(path).read_bytes()
 
 
 class FunctionLearner(Learner):
@@ -143,9 +139,9 @@ class FunctionLearner(Learner):
 
     def __init__(self, name: str, run: Run) -> None:
         super().__init__(name, run)
-        self._named = f"{run.field}='train:{name}'"
-        self._function, self.source = load_function(name, run.field)
-        check_signature(name, self._function, self.hyperparameters, run.field)
+        self._named = f"algorithm='train:{name}'"
+        self._function, self.source = load_function(name)
+        check_signature(name, self._function, self.hyperparameters)
         self.yields_policies = inspect.isgeneratorfunction(self._function)
         self.only_at_the_end = not self.yields_policies
         env = SMEEnv(run.document, action_range=run.action_range)

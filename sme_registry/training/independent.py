@@ -69,7 +69,6 @@ class IndependentLearner(SB3Learner):
                 seed=random_seed(run.seed, agent),
                 steps=run.steps,
                 hyperparameters=self.hyperparameters,
-                field=run.field,
             )
             _check(models[agent_name], self.name)
         return models

@@ -40,7 +40,7 @@ _RECENT = 20  # episodes in the running mean that the progress shows
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """What a learner learns, and how; errors call its name `field`.
+    """What a learner learns, and how.
 
     `num_envs` is 1 where that is None, and more for a team and an on-policy algorithm. `piece` is
     the most steps between two pauses of what has them at any step.
@@ -54,7 +54,6 @@ class Run:
     num_envs: int | None = None
     device: str | None = None
     piece: int = 100
-    field: str = "uses"
 
 
 class Steps(NamedTuple):

@@ -71,10 +71,9 @@ def new_model(
     seed: int,
     steps: int,
     hyperparameters: Mapping[str, Any],
-    field: str = "uses",
 ) -> Any:
     """Create a model that learns in a `VecEnv`, from so many steps of all its lanes."""
-    algorithm = load_algorithm(name, field)
+    algorithm = load_algorithm(name)
     settings = resolved(hyperparameters)
     if isinstance(algorithm, type) and is_sb3(algorithm):
         if is_off_policy(algorithm):
@@ -84,7 +83,7 @@ def new_model(
             model = algorithm(policy, env, seed=seed, device="cpu", **settings)
         except (AssertionError, MemoryError, TypeError, ValueError) as error:
             raise OptionError(
-                f"{field}={name!r}: rejects the task or the hyperparameters "
+                f"algorithm={name!r}: rejects the task or the hyperparameters "
                 f"{sorted(hyperparameters)}: {error}. Change them, or create the learner in a "
                 "function and give module:function."
             ) from error
@@ -93,14 +92,14 @@ def new_model(
             inspect.signature(algorithm).bind(env, seed=seed, **settings)
         except TypeError as error:
             raise OptionError(
-                f"{field}={name!r}: cannot be called with an environment, seed= and the "
+                f"algorithm={name!r}: cannot be called with an environment, seed= and the "
                 f"hyperparameters {sorted(settings)}: {error}. Give only those that it accepts."
             ) from None
         model = algorithm(env, seed=seed, **settings)
     missing = [method for method in ("learn", "predict") if not hasattr(model, method)]
     if missing:
         raise OptionError(
-            f"{field}={name!r}: returned a {type(model).__name__}, which has no "
+            f"algorithm={name!r}: returned a {type(model).__name__}, which has no "
             f"{' and no '.join(missing)}. Return a learner like those of Stable-Baselines3."
         )
     if is_sb3(model):
@@ -127,7 +126,6 @@ def new_sb3_model(
         seed=seed,
         steps=steps,
         hyperparameters=settings,
-        field="algorithm",
     )
 
 
@@ -284,7 +282,7 @@ class SB3Learner(Learner):
     def __init__(self, name: str, run: Run) -> None:
         super().__init__(name, run)
         self._seed, spec = run.seed, run.document.specs[0]
-        algorithm = load_algorithm(name, run.field)
+        algorithm = load_algorithm(name)
         num_envs = run.num_envs or default_num_envs(spec, algorithm)
         kind: Any = SMEVecEnv if spec.team is None else SMETeamVecEnv
         env = kind(run.document, num_envs, action_range=run.action_range)
@@ -304,7 +302,6 @@ class SB3Learner(Learner):
             seed=self.run.seed,
             steps=self.run.steps * len(self.env.names),
             hyperparameters=self.hyperparameters,
-            field=self.run.field,
         )
         return {"": model}
 
@@ -353,7 +350,7 @@ class SB3Learner(Learner):
         self.model.learn(left)
         if self.steps < self.run.steps:
             raise PolicyError(
-                f"uses={self.name!r}: learn({left}) returned after {self.steps} steps of its "
+                f"algorithm={self.name!r}: learn({left}) returned after {self.steps} steps of its "
                 "environment. It must take all of them, in that environment."
             )
 
@@ -373,8 +370,9 @@ class SB3Learner(Learner):
             copied = copy.deepcopy(network or self.model, {id(self.env): self.env})
         except Exception as error:
             raise PolicyError(
-                f"uses={self.name!r}: cannot live in a stream, since its learner cannot be copied "
-                f"at the end of a visit: {type(error).__name__}: {error}. Give it a __deepcopy__."
+                f"algorithm={self.name!r}: cannot live in a stream, since its learner cannot be "
+                f"copied at the end of a visit: {type(error).__name__}: {error}. Give it a "
+                "__deepcopy__."
             ) from error
         return numpy_policy(copied, self.run.document, action_range=self.run.action_range)
 

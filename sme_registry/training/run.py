@@ -201,7 +201,7 @@ def train(
     choice("action_range", action_range, ACTION_RANGES)
     protocol = resolve_protocol(protocol or default_protocol(steps))
     uses = full_name(default_algorithm(document) if algorithm is None else algorithm, agents)
-    entry = find(f"independent:{uses}" if independent else uses, "algorithm")
+    entry = find(f"independent:{uses}" if independent else uses)
     independent = entry.kind == "independent"
     hyperparameters = nested_hyperparameters(hyperparameters or {})
     with quiet():
@@ -218,7 +218,7 @@ def train(
             algorithm=entry.name if independent else entry.uses,
             hyperparameters=hyperparameters,
             device=_device(entry, device),
-            source=source_of(entry.uses, "algorithm") or "",
+            source=source_of(entry.uses) or "",
             seed=integer_in("seed", seed, 0, 2**32 - num_envs),
             action_range=action_range,
             num_envs=num_envs,
@@ -243,7 +243,6 @@ def train(
             num_envs=record.num_envs,
             device=record.device,
             piece=min(100, record.checkpoint_every),
-            field="algorithm",
         )
         with _show_advice(console or err()):
             learner = entry.learner(run)  # rejects hyperparameters before the folder is created
@@ -293,7 +292,7 @@ def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
 
 def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None) -> int:
     if entry.backend.several and isinstance(document, SMESpec):
-        default = default_num_envs(document, load_algorithm(entry.name, "algorithm"))
+        default = default_num_envs(document, load_algorithm(entry.name))
         return integer_in("num_envs", default if num_envs is None else num_envs, 1, 4096)
     if num_envs not in (None, 1):
         raise OptionError(

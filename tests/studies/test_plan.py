@@ -258,7 +258,7 @@ def test_a_plan_of_what_is_not_installed_is_planned_with_a_note(tmp_path):
     result = commands.good("study", "plan", "p.json", "--json")
     assert json.loads(result.stdout)["algorithms"] == ["constant", "one", "other"]
     (line,) = result.stderr.splitlines()
-    assert line.startswith("cannot run here: uses='theirs:make': cannot be imported")
+    assert line.startswith("cannot run here: algorithm='theirs:make': cannot be imported")
     assert commands.good("study", "plan", "p.json", "--only", "algorithm=constant").stderr == ""
     assert "theirs:make" in refused("run", "p.json", "-f", "s")
     assert "theirs:make" in refused("new", "n.json", "--from", "p.json")

@@ -205,7 +205,7 @@ def test_a_reference_is_judged_as_often_as_a_learner_would_be():
 
 def test_what_cannot_be_run_is_refused():
     team = SPEC.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
-    with pytest.raises(SpecError, match="uses='offline:bc': learns a task of a single agent, and"):
+    with pytest.raises(SpecError, match="algorithm='offline:bc': learns a task of a single agent"):
         run_cell(cell("offline:bc", spec=team))
     with pytest.raises(OptionError, match="degree: reference:linear has no such hyperparameter"):
         run_cell(cell("reference:linear", hyperparameters={"degree": 2}))
