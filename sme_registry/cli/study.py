@@ -195,11 +195,8 @@ def report(
       sme study report runs/all --full --out paper/study --format pdf,latex
       sme study report runs/smoke --explorers
     """
-    chosen = [name.strip() for name in formats.split(",") if name.strip()]
-    files = studies.write_report(
-        folder, out_folder, tuple(dict.fromkeys(chosen)), explorers=explorers, full=full
-    )
-    _print_report(files)
+    chosen = [name.strip() for name in formats.split(",")]
+    _print_report(studies.write_report(folder, out_folder, chosen, explorers=explorers, full=full))
 
 
 def _print_report(files: Sequence[Path]) -> None:
@@ -219,7 +216,7 @@ def print_status(status: StudyStatus, json: bool) -> None:
     counts = status.counts
     algorithms = unique(algorithm for _, algorithm in counts)
     rows = [
-        {"class": name, **{each: _counts(counts.get((name, each))) for each in algorithms}}
+        {"class": name, **{each: _counts(counts[name, each]) for each in algorithms}}
         for name in unique(class_name for class_name, _ in counts)
     ]
     title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"
@@ -240,8 +237,7 @@ def print_status(status: StudyStatus, json: bool) -> None:
 
 def _print_failure(status: StudyStatus, cell: CellStatus) -> None:
     failure = cell.failure
-    if failure is None:
-        return
+    assert failure is not None
     times = f" ({failure.attempts} times)" if failure.attempts > 1 else ""
     path = Ledger(status.folder).failure_path(failure.key).as_posix()
     print_line(
@@ -250,10 +246,8 @@ def _print_failure(status: StudyStatus, cell: CellStatus) -> None:
     )
 
 
-def _counts(counts: Counter[State] | None) -> str:
-    """`7 +2 !1 / 10`: done, running, failed, all; empty without cells."""
-    if counts is None:
-        return ""
+def _counts(counts: Counter[State]) -> str:
+    """`7 +2 !1 / 10`: done, running, failed, all."""
     others = {"+": counts["running"], "!": counts["failed"], "/ ": counts.total()}
     return " ".join([str(counts["done"]), *(f"{sign}{n}" for sign, n in others.items() if n)])
 
@@ -302,11 +296,8 @@ def compare(
         implementation_caveats,
     )
 
-    metrics = tuple(metric or write.DEFAULT_METRICS)
-    differences = write.compare(folder, first, second, metrics)
-    files = []
-    if out_folder is not None:
-        files = write.write_comparison(folder, out_folder, first, second, metrics)
+    differences = write.compare(folder, first, second, metric or write.DEFAULT_METRICS)
+    files = [] if out_folder is None else write.write_comparison(folder, out_folder, differences)
     if json:
         print_json(records(differences))
         return

@@ -352,15 +352,10 @@ def compare(
 
 
 def write_comparison(
-    folder: str | os.PathLike[str],
-    out: str | os.PathLike[str],
-    first: str,
-    second: str,
-    metrics: Sequence[str] = DEFAULT_METRICS,
+    folder: str | os.PathLike[str], out: str | os.PathLike[str], table: pd.DataFrame
 ) -> list[Path]:
-    """Write a comparison: differences.csv and .json, a .tex for each metric, and figures."""
+    """Write the result of `compare`: differences.csv and .json, a .tex a metric, and figures."""
     check_writable(Path(out) / "differences.csv")
-    table = compare(folder, first, second, metrics)
     contents: dict[str, str | bytes] = {
         "differences.csv": table.to_csv(index=False, lineterminator="\n"),
         "differences.json": to_json(records(table)),
@@ -369,8 +364,8 @@ def write_comparison(
     ledger = Ledger(folder)
     file = ledger.study_file()
     algorithms = {algorithm.name: algorithm for algorithm in file.plan.algorithms}
-    both = {"algorithms": (algorithms[first], algorithms[second])}
-    plan = file.plan.model_copy(update=both)
+    both = tuple(algorithms[table[column].iloc[0]] for column in ("first", "second"))
+    plan = file.plan.model_copy(update={"algorithms": both})
     results = ledger.results(cell.cell.digest for cell in plan.cells)
     both_alone = file.model_copy(update={"plan": plan})
     analysis = analyse(both_alone, results, coloured=file.plan.algorithms)
