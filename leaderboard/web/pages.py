@@ -357,8 +357,12 @@ class Pages:
     @cached_property
     def _static(self) -> dict[str, bytes]:
         """The files in static/, by name."""
+        paths = [path for folder in self._folders for path in (folder / "static").iterdir()]
         of_explorers = STATIC if self._explorers else {}
-        return _static(*self._folders) | {k: text.encode() for k, text in of_explorers.items()}
+        return {
+            **{path.name: path.read_bytes() for path in sorted(paths)},
+            **{name: text.encode() for name, text in of_explorers.items()},
+        }
 
     @cached_property
     def _files(self) -> list[dict[str, Callable[[], str]]]:
@@ -408,7 +412,6 @@ class Pages:
                 for section, files in zip(self._sections, self._files, strict=True)
                 if section.link[0] in files
             ),
-            "marks": tables.MARKS,
             "address_digits": SHORT,
             "metrics": list(RANKED.values()),
             "places": self.store.queue.places(),
@@ -441,13 +444,6 @@ def _environment(*folders: Path) -> Environment:
         "steps": tables.steps_text,
     }
     return templates
-
-
-@cache
-def _static(*folders: Path) -> dict[str, bytes]:
-    """The files in static/ of these folders, by name."""
-    paths = [path for folder in folders for path in sorted((folder / "static").iterdir())]
-    return {path.name: path.read_bytes() for path in paths}
 
 
 def _log_page(number: int) -> str:

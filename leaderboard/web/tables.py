@@ -39,16 +39,6 @@ _INSTANCES = 100  # of a class, on the page of the suite
 SHORT = 16  # hex digits of an id in an address: too many for a deliberate collision
 
 
-MARKS = {
-    "reference": "reference row",
-    "too_few_runs": "too few runs",
-    "copy": "copy",
-    "superseded": "superseded",
-    "not_learned": "not learned",
-}
-"""Short names of the reasons in `ranking.REASONS`."""
-
-
 def task_rows(document: BoardDocument) -> list[dict[str, Any]]:
     """The classes of a board's suite, with the runs that a rank needs, and the first instances."""
     return [
