@@ -34,7 +34,7 @@ from leaderboard.documents.submission import (
     Training,
     check_names,
     check_runs,
-    now,
+    manifest_fields,
 )
 from leaderboard.errors import Rejection
 from leaderboard.gate.sandbox import inspect_own, widths
@@ -166,18 +166,12 @@ def make_bundle(
         for member in suite.suite.classes
     }
     fields = {
+        **manifest_fields(
+            *(key.public, method, version, family, knowledge, submitter, code, statement)
+        ),
         "suite": {"name": suite.versioned_name, "digest": suite.digest},
-        "method": {
-            "name": method,
-            "version": version,
-            "family": method if family is None else family,
-            "knowledge": knowledge,
-        },
-        "code": code,
-        "submitter": {"name": submitter, "key": key.public},
         "runs_started": of_class | (runs_started or {}),
         "training": _training_facts(listed) if training is None else training,
-        "statement": statement,
     }
     # Everything that does not depend on the policies is checked before they are exported.
     placeholders = [
@@ -209,7 +203,7 @@ def _submission(
         {"spec": run.spec.digest, "seed": run.seed, "steps": run.steps, "artefact": artefact}
         for run, artefact in zip(listed, artefacts, strict=True)
     ]
-    submission = Submission.from_dict({**fields, "created": now(), "runs": runs})
+    submission = Submission.from_dict({**fields, "runs": runs})
     check_names(submission)
     check_runs(suite.suite, submission, [run.source for run in listed])
     return submission

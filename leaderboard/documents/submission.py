@@ -248,6 +248,27 @@ def now() -> str:
     return utc(datetime.datetime.fromtimestamp(time.time(), datetime.UTC))
 
 
+def manifest_fields(
+    key: str,
+    method: str,
+    version: str,
+    family: str | None,
+    knowledge: str,
+    submitter: str,
+    code: str | None,
+    statement: str,
+) -> dict[str, Any]:
+    """The fields of a `Manifest`, signed now."""
+    kind = {"family": family or method, "knowledge": knowledge}
+    return {
+        "method": {"name": method, "version": version, **kind},
+        "code": code,
+        "submitter": {"name": submitter, "key": key},
+        "created": now(),
+        "statement": statement,
+    }
+
+
 def check_names(manifest: Manifest, board_key: str | None = None) -> None:
     """Reject what is unsafe to show (`unsafe_name`): markup, formulas, control characters.
 

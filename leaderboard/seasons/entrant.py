@@ -28,7 +28,7 @@ from leaderboard.cli.submit import (
     receiver_of,
 )
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
-from leaderboard.documents.submission import now
+from leaderboard.documents.submission import manifest_fields
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.publication import read_season
 from leaderboard.seasons.scoring import enter as enter_folder
@@ -400,27 +400,6 @@ def read_file(path: Path) -> bytes:
         return read_regular(path, _FILE_BYTES, links=True)
     except OSError as error:
         raise OptionError(f"{path}: cannot be read: {error.strerror}. Correct the path.") from None
-
-
-def manifest_fields(
-    key: str,
-    method: str,
-    version: str,
-    family: str | None,
-    knowledge: str,
-    submitter: str,
-    code: str | None,
-    statement: str,
-) -> dict[str, Any]:
-    """The fields of a `Manifest`, signed now."""
-    kind = {"family": family or method, "knowledge": knowledge}
-    return {
-        "method": {"name": method, "version": version, **kind},
-        "code": code,
-        "submitter": {"name": submitter, "key": key},
-        "created": now(),
-        "statement": statement,
-    }
 
 
 def signer_of(request: Signed[TicketRequest], key: SigningKey) -> Signer | None:
