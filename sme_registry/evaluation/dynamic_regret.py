@@ -25,7 +25,6 @@ import numpy.typing as npt
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import retention
-from sme_registry.evaluation.evaluate import same_draw
 from sme_registry.evaluation.policies import Policy, check_count, stream_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import numbers_in, rollouts, start_states
@@ -371,8 +370,9 @@ def reference_regret(
     first = retention.final_specs(stream)[0]
     # No regret in the task of which it is the optimum, also where this rounds observations.
     optimum = reference_policy("optimal", first)
+    drawn = first.as_drawn.digest
     same_task = [
-        phase.drift is None and same_draw(phase.spec) == same_draw(first) for phase in stream.phases
+        phase.drift is None and phase.spec.as_drawn.digest == drawn for phase in stream.phases
     ]
     lives: dict[str, list[Any]] = {
         "frozen_optimum": [0.0 if mine else optimum for mine in same_task] * stream.cycles,

@@ -134,7 +134,7 @@ def evaluate_many(
     groups: dict[str, dict[int, Subject]] = {}
     for index, (policy, task) in enumerate(policies):
         spec = load(task, SMESpec)
-        groups.setdefault(same_draw(spec), {})[index] = as_policy(policy, spec), spec
+        groups.setdefault(spec.as_drawn.digest, {})[index] = as_policy(policy, spec), spec
 
     reports: dict[int, EvaluationReport | PolicyError] = {}
     states_of_each = protocol.states_per_region * len(protocol.edges)
@@ -184,20 +184,6 @@ def versions_behind() -> dict[str, str]:
     return versions(["numpy", "scipy", "gymnasium", *numba], if_imported=_POLICY_LIBRARIES)
 
 
-def same_draw(spec: SMESpec) -> str:
-    """The same for specs whose states, optimal actions and references are the same."""
-    return spec.as_drawn.digest
-
-
-class _Batch(NamedTuple):
-    """A batch of states, and what is the same for all policies in them."""
-
-    states: States
-    s: Array  # `[B, S]` float64
-    optimal: Array  # `[B, A]` π*(s)
-    limit: Array  # `[B, A]` ℓ(s); without safety `[B, 0]`
-
-
 class _Region(NamedTuple):
     """What was measured in a region, of each policy and reference."""
 
@@ -230,19 +216,15 @@ class Measurement:
         count = 0
         for region in range(len(self._protocol.edges)):
             measured = self._begin(region)
-            random = Uniform(self._protocol.seed, f"evaluation/{region}/random_action")
-            for batch in self._batches(region, first):
-                actions = self._add_policies(measured, batch)
+            for drawn, known in self._batches(region, fitted, first):
+                actions = self._add_policies(measured, drawn, known.optimal)
                 if len(self._failed) == len(self._subjects):
                     return
-                known = references.Knowledge(
-                    self._task, batch.s, lambda: fitted, random, batch.optimal, batch.limit
-                )
                 others = references.actions(known, self._references)
                 for name, a in others.items():
-                    measured.errors[name].add(a, batch.optimal)
-                self._add_safety(measured, batch, {**actions, **others})
-                count += len(batch.s)
+                    measured.errors[name].add(a, known.optimal)
+                self._add_safety(measured, known, {**actions, **others})
+                count += len(known.s)
                 yield count
             self._regions.append(measured)
 
@@ -288,23 +270,25 @@ class Measurement:
             distraction=_Distraction(self._task, self._protocol, region, len(self._subjects)),
         )
 
-    def _add_policies(self, measured: _Region, batch: _Batch) -> dict[Any, Array]:
+    def _add_policies(self, measured: _Region, drawn: States, optimal: Array) -> dict[Any, Array]:
         """Add a batch of the policies; their actions `[B, A]` in [0, 1]."""
         actions: dict[Any, Array] = {}
-        act = functools.partial(self._actions, batch.states)
-        for index, unclipped in act(batch.states.seen(self._task)):
+        act = functools.partial(self._actions, drawn)
+        for index, unclipped in act(drawn.seen(self._task)):
             a = actions[index] = np.clip(unclipped, 0.0, 1.0)
-            measured.errors[index].add(a, batch.optimal, a != unclipped)
+            measured.errors[index].add(a, optimal, a != unclipped)
         if self._task.spec.distractors:
-            measured.distraction.add(batch.states, batch.optimal, actions, act)
+            measured.distraction.add(drawn, optimal, actions, act)
         return actions
 
-    def _add_safety(self, measured: _Region, batch: _Batch, actions: dict[Any, Array]) -> None:
+    def _add_safety(
+        self, measured: _Region, known: references.Knowledge, actions: dict[Any, Array]
+    ) -> None:
         """Add a batch of the policies and references, `[B, A]` or `[A]` in [0, 1]."""
         for r_min, task in self._limited.items():
-            safe_reward = task.safe_reward_of(batch.optimal, batch.limit)
+            safe_reward = task.safe_reward_of(known.optimal, known.limit)
             for key, a in actions.items():
-                measured.safety[key, r_min].add(a, batch.optimal, batch.limit, safe_reward)
+                measured.safety[key, r_min].add(a, known.optimal, known.limit, safe_reward)
 
     def _actions(self, drawn: States, x: npt.NDArray[Any]) -> Iterator[tuple[int, Array]]:
         """The actions, not clipped, of each policy that has not failed, where agents see x."""
@@ -317,14 +301,18 @@ class Measurement:
                 except PolicyError as error:
                     self._failed[index] = error
 
-    def _batches(self, region: int, first: Iterator[Array]) -> Iterator[_Batch]:
-        """The states of a region, with π* of its first batches where these are known."""
+    def _batches(
+        self, region: int, fitted: references.References, first: Iterator[Array]
+    ) -> Iterator[tuple[States, references.Knowledge]]:
+        """The states of a region and what is known of them; `first` is π* of the first batches."""
+        random = Uniform(self._protocol.seed, f"evaluation/{region}/random_action")
         for drawn in states(self._protocol, region, self._task.spec):
             s = drawn.s.astype(np.float64)
             optimal = next(first, None)
             if optimal is None:
                 optimal = self._oracle.optimal_action(s)
-            yield _Batch(drawn, s, optimal, self._limit_of(s))
+            limit = self._limit_of(s)
+            yield drawn, references.Knowledge(self._task, s, lambda: fitted, random, optimal, limit)
 
     @functools.cached_property
     def _limit_of(self) -> Callable[[Array], Array]:

@@ -33,7 +33,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from sme_registry.evaluation.evaluate import OnBatch, same_draw
+from sme_registry.evaluation.evaluate import OnBatch
 from sme_registry.evaluation.policies import Policy, prefixed_errors
 from sme_registry.evaluation.regions import (
     BATCH_NUMBERS,
@@ -278,7 +278,7 @@ def stream_regrets(
     """
     specs = final_specs(stream)
     tasks = materialize_together(specs)
-    keys = [same_draw(spec) for spec in specs]
+    keys = [spec.as_drawn.digest for spec in specs]
     oracles = {key: engine(task) for key, task in zip(keys, tasks, strict=True)}
     P, K = len(specs), len(protocol.edges)
     errors, half = np.zeros((len(actors), P, K)), np.zeros((P, K))
