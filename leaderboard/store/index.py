@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import functools
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping
@@ -113,6 +112,7 @@ CREATE TABLE upload (
 ) STRICT, WITHOUT ROWID;
 CREATE TABLE clock (boot TEXT PRIMARY KEY, offset REAL NOT NULL) STRICT, WITHOUT ROWID;
 """
+_STATEMENTS = list(filter(None, map(str.strip, SCHEMA.split(";"))))  # as SQLite keeps them
 
 _Model = TypeVar("_Model", bound=StrictModel)
 _Row = TypeVar("_Row", bound=EntryRow)
@@ -170,7 +170,8 @@ class Index:
     @property
     def is_current(self) -> bool:
         """Whether it has exactly the tables of this version, and is of this board."""
-        if _definitions(self.connection) != _expected():
+        rows = self.connection.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL")
+        if sorted(text for (text,) in rows) != sorted(_STATEMENTS):
             return False
         return self.one("SELECT board FROM head") == (self.document.digest,)
 
@@ -182,7 +183,7 @@ class Index:
             "SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')"
         ).fetchall():
             execute(f'DROP {kind} "{name}"')
-        for statement in SCHEMA.split(";"):
+        for statement in _STATEMENTS:
             execute(statement)
         self.connection.executemany("INSERT INTO upload VALUES (?, ?, ?, ?)", uploads)
 
@@ -449,20 +450,6 @@ def _connect(target: str) -> sqlite3.Connection:
     return sqlite3.connect(
         target, timeout=BUSY_SECONDS, isolation_level=None, check_same_thread=False
     )
-
-
-def _definitions(connection: sqlite3.Connection) -> list[tuple[Any, ...]]:
-    """Of all tables, indices, views and triggers."""
-    return connection.execute(
-        "SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY type, name"
-    ).fetchall()
-
-
-@functools.cache
-def _expected() -> list[tuple[Any, ...]]:
-    with contextlib.closing(_connect(":memory:")) as connection:
-        connection.executescript(SCHEMA)
-        return _definitions(connection)
 
 
 FEATURES, ALIKE, SAME_SCALE = 32, 0.001, 0.9

@@ -57,23 +57,16 @@ def test_a_season_is_played_from_its_announcement_to_its_results_and_reindexed(s
     ]
     for season in (offline, online):
         [row] = store.entrants(season.digest)
-        assert row.number == 1
-        assert row.status == "scored"
-        assert row.scores is not None
-        assert row.scores.wd_regret.value == 1.0
+        assert (row.number, row.status) == (1, "scored")
         assert store.sealed_result(row) == failed_result(season, row.id)
         assert store.revealed_master(season.id) == MASTER
-    assert store.entry_of(store.entrants(offline.digest)[0]).is_valid(store.document.key)
-    assert store.request_of(store.ticket(online.digest, 1)).is_valid(store.document.key)
     grown = derived(store)
     store.reindex()
     assert derived(store) == grown
     with SeasonStore.open(store.folder.path, read_only=True) as reader:
         assert derived(reader) == grown
-    [missing] = verify(
-        store.folder.path, board=SeasonStore
-    ).missing  # an answer that the board lost
-    assert missing.startswith("sha256:aa")
+    report = verify(store.folder.path, board=SeasonStore)
+    assert report.missing == [ANSWER["sha256"]]  # which the board lost
 
 
 @pytest.mark.parametrize("track", [OFFLINE, ONLINE])

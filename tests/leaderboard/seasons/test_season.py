@@ -322,36 +322,25 @@ def test_digests_do_not_depend_on_the_processor(season, kernel):
     assert done.stdout.split() == [each.data for each in season.published], done.stderr
 
 
-def test_another_machines_rounding_is_told_from_other_data(tmp_path, season, published, later):
+def test_another_machines_rounding_is_no_false_publication(store, season, published, later):
     """As if the organiser's processor had rounded rewards otherwise than this one."""
-    later()
-    folder = tmp_path / "copy"
-    shutil.copytree(published, folder)
     fields = season.to_dict()
-    for number, (hidden, error) in enumerate(zip(season.hidden, (1e-7, 1e-4), strict=True)):
-        path = dataset_path(folder, season.id, hidden)
-        data = SealedDataset.read(path)
-        data = dataclasses.replace(data, rewards=data.rewards + np.float32(error))
-        shutil.rmtree(path)
-        data.write(f"sealed/{season.id}/deep-{number}-v0", folder / "datasets")
-        fields["published"][number]["data"] = data.digest
-    for count in (1, 2):  # the first rounds otherwise, the second has other data
-        terms = {**fields, "published": fields["published"][:count]}
-        terms["classes"][0]["instances"] = count
-        with tiny_board(tmp_path / str(count)) as store:
-            false = false_season(store, Season.from_dict(terms))
-            assert replayed(store)[0]["data sets"] == (0, count)
-            copy = store.season_folder(false.digest) / "published"
-            shutil.copytree(published, copy)
-            with pytest.raises(BoardError, match="Download it again"):
-                replayed(store)
-            shutil.rmtree(copy)
-            shutil.copytree(folder, copy)
-            if count == 1:
-                assert replayed(store)[0]["data sets, within 1e-6"] == (1, 0)
-            else:
-                with pytest.raises(TamperedError, match="published deep 1"):
-                    replayed(store)
+    fields["published"] = fields["published"][:1]
+    fields["classes"][0]["instances"] = 1
+    path = dataset_path(published, season.id, next(season.hidden))
+    data = SealedDataset.read(path)
+    data = dataclasses.replace(data, rewards=data.rewards + np.float32(1e-7))
+    fields["published"][0]["data"] = data.digest
+    later()
+    false = false_season(store, Season.from_dict(fields))
+    assert replayed(store)[0]["data sets"] == (0, 1)
+    copy = store.season_folder(false.digest) / "published"
+    shutil.copytree(published, copy)
+    with pytest.raises(BoardError, match="Download it again"):
+        replayed(store)
+    shutil.rmtree(dataset_path(copy, season.id, next(season.hidden)))
+    data.write(f"sealed/{season.id}/deep-0-v0", copy / "datasets")
+    assert replayed(store)[0]["data sets, within 1e-6"] == (1, 0)
 
 
 @pytest.mark.parametrize(("needed", "reason"), [(1, ""), (2, "too_few_runs")])
