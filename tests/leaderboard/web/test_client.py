@@ -9,15 +9,14 @@ import pytest
 
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import Receiver, SigningKey
-from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entrant import request_ticket
-from leaderboard.seasons.season import TicketRequest
 from leaderboard.web import client
 from sme_registry.errors import OptionError
 from sme_registry.seasons import wire
 from sme_registry.spec import Setting
 from tests.leaderboard.conftest import tiny_submission, write_bundle
+from tests.leaderboard.seasons.sealing import signed_request, tiny_season
 
 
 @pytest.fixture(autouse=True)
@@ -158,7 +157,7 @@ def test_an_answer_is_raw_bytes_up_to_a_limit():
     ("field", "value"),
     [("instances", 10**12), ("name", "x" * 10**5), ("name", "x" * 10**7)],
 )
-def test_a_ticket_that_is_too_large_is_refused_by_its_size(key, field, value):
+def test_a_ticket_that_is_too_large_is_refused_by_its_size(store, key, field, value):
     member = {"name": "deep", "setting": Setting().to_dict(), "instances": 1, "budget": 9}
     ticket = {
         "season": "autumn",
@@ -168,17 +167,7 @@ def test_a_ticket_that_is_too_large_is_refused_by_its_size(key, field, value):
         "lanes": 1,
         "classes": [{**member, field: value}],
     }
-    request = TicketRequest.from_dict(
-        {
-            "method": {"name": "X", "version": "1", "family": "x", "knowledge": "generic"},
-            "submitter": {"name": "Tester", "key": key.public},
-            "created": now(),
-            "season": "sha256:" + "0" * 64,
-            "nonce": "0" * 64,
-            "answers_key": key.of_answers("0" * 64).public,
-        }
-    )
-    signed = request.signed(key, Receiver(key.public))
+    signed = signed_request(store, tiny_season("sealed-online"), key)
     with (
         scripted(lambda *_: (201, json.dumps(ticket).encode())) as (url, _),
         pytest.raises(BoardError) as caught,
