@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -175,54 +175,46 @@ def draw_class_curves(analysis: Analysis) -> Drawn:
     rows = analysis.tables["learning_curves"]
     rows = rows[(rows.measure == "regret") & rows.algorithm.isin(analysis.learners)]
     looks = looks_of(analysis, rows.algorithm)
-    if len(looks) > 1:
-        yield Picture(
-            "learning-curves-by-class",
-            "Learning curves of all algorithms by class",
-            f"{curves_caption(rows)} Mean exact regret per step, 0 for the optimum.",
-            _lines_by_class(
-                rows, looks, lambda axes, _: panels.tick_steps(axes),
-                {name: f" ({c.label})" for name, c in analysis.classes.items() if c.label},
-                (0.8, 1.9), x="steps",
-            ),
-        )  # fmt: skip
+    if len(looks) < 2:
+        return
+
+    def draw_class(axes: Axes, of_class: pd.DataFrame) -> None:
+        panels.draw_lines(axes, of_class, "algorithm", looks)
+        panels.tick_steps(axes)
+
+    labels = {
+        name: f"{name} ({c.label})".removesuffix(" ()") for name, c in analysis.classes.items()
+    }
+    items = [(labels[name], of_class) for name, of_class in panels.by(rows, "class_name")]
+    yield Picture(
+        "learning-curves-by-class",
+        "Learning curves of all algorithms by class",
+        f"{curves_caption(rows)} Mean exact regret per step, 0 for the optimum.",
+        panel_grid(items, draw_class, (0.8, 1.9), x="steps", y=CURVES["regret"], looks=looks),
+    )
 
 
 def draw_lifetime_curves(analysis: Analysis) -> Drawn:
     rows = analysis.tables["stream_learning_curves"]
     rows = rows[rows.measure == "regret"]
-    if not rows.empty:
-        yield Picture(
-            "stream-learning-curves",
-            "Learning curves of lives",
-            f"{curves_caption(rows)} Mean exact regret per step in evaluations during training, on "
-            "the task in force. Shades and numbers above are visits and their phases.",
-            _lines_by_class(
-                rows, looks_of(analysis, rows.algorithm),
-                lambda axes, name: _finish_lifetime(axes, analysis, name), {}, _HEIGHTS,
-                x="lifetime (steps)", title_pad=_PAD,
-            ),
-        )  # fmt: skip
+    if rows.empty:
+        return
+    looks = looks_of(analysis, rows.algorithm)
 
+    def draw_stream(axes: Axes, of_stream: pd.DataFrame) -> None:
+        panels.draw_lines(axes, of_stream, "algorithm", looks)
+        _finish_lifetime(axes, analysis, of_stream.class_name.iloc[0])
 
-def _lines_by_class(
-    rows: pd.DataFrame,
-    looks: Mapping[str, Look],
-    finish: Callable[[Axes, str], None],
-    labels: Mapping[str, str],
-    heights: tuple[float, float],
-    **options: Any,
-) -> Figure:
-    """A panel for each class, or stream, with a line for each algorithm."""
-
-    def draw_class(axes: Axes, of_class: pd.DataFrame) -> None:
-        panels.draw_lines(axes, of_class, "algorithm", looks)
-        finish(axes, of_class.class_name.iloc[0])
-
-    items = [
-        (name + labels.get(name, ""), of_class) for name, of_class in panels.by(rows, "class_name")
-    ]
-    return panel_grid(items, draw_class, heights, y=CURVES["regret"], looks=looks, **options)
+    yield Picture(
+        "stream-learning-curves",
+        "Learning curves of lives",
+        f"{curves_caption(rows)} Mean exact regret per step in evaluations during training, on the "
+        "task in force. Shades and numbers above are visits and their phases.",
+        panel_grid(
+            panels.by(rows, "class_name"), draw_stream, _HEIGHTS, x="lifetime (steps)",
+            y=CURVES["regret"], looks=looks, title_pad=_PAD,
+        ),
+    )  # fmt: skip
 
 
 def draw_learning_curves(analysis: Analysis) -> Drawn:
