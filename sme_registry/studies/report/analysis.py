@@ -84,7 +84,7 @@ class RunKind(NamedTuple):
 
     streams: bool
     runs: pd.DataFrame
-    axes: Mapping[str, str]  # of each class; the first is that which others are compared with
+    classes: Mapping[str, ClassInfo | StreamInfo]  # the others are compared with the first
     algorithms: tuple[str, ...]
     metrics: tuple[Metric, ...]
     instance: str  # the column that says on which instance a run is
@@ -139,16 +139,14 @@ class Analysis:
 
     @property
     def parts(self) -> tuple[RunKind, ...]:
-        axes = {name: info.axis for name, info in self.classes.items()}
         metrics = metrics_of("run", self.runs)
-        tasks = RunKind(False, self.runs, axes, self.algorithms, metrics, "spec_digest")
+        tasks = RunKind(False, self.runs, self.classes, self.algorithms, metrics, "spec_digest")
         if not self.streams:
             return (tasks,)
         lives = self.tables["stream_lives"]
         lives = lives[lives.region == WITHIN].reset_index(drop=True)
-        axes = {name: info.axis for name, info in self.streams.items()}
-        metrics = metrics_of("life")
-        return tasks, RunKind(True, lives, axes, self.stream_algorithms, metrics, "stream_digest")
+        algorithms, metrics = self.stream_algorithms, metrics_of("life")
+        return tasks, RunKind(True, lives, self.streams, algorithms, metrics, "stream_digest")
 
     def missing(self, *, streams: bool) -> pd.DataFrame:
         places = self.places
@@ -235,7 +233,8 @@ def summary(
     `fewest` runs on. `seed` is called with the place, the metric and the values of `by`.
     """
     for at, of_place in rows.groupby([*place], sort=False):
-        for where, group in of_place.groupby([*by], sort=False) if by else [((), of_place)]:
+        groups = of_place.groupby([*by], sort=False, dropna=False) if by else [((), of_place)]
+        for where, group in groups:
             for metric in metrics:
                 values = group[[metric.key]].dropna().to_numpy(dtype=np.float64)
                 if not len(values):
@@ -279,7 +278,6 @@ def counted(places: pd.DataFrame, **properties: pd.Series) -> pd.DataFrame:
 _AT = "region:str visit:int64 phase:int64 metric:str"
 _POINTS = 201  # of a curve of regret
 _EPISODES = 1000  # in which the reference agents act, over all draws of a stream
-_INITIAL = -1
 
 Costs = Mapping[tuple[str, str], Sequence[DynamicRegret]]
 """(class, reference) → the expected dynamic regret of a reference agent in each draw."""
@@ -313,11 +311,10 @@ def _visit_metrics(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 @table("stream_matrices", "")
 def _matrices(analysis: Analysis) -> pd.DataFrame:
     rows = analysis.tables["stream_retention"]
-    rows = rows.assign(visit=rows.visit.fillna(_INITIAL).astype("int64"))
     of_phases = metrics_of("visit", rows.columns)
-    rows = _summary(analysis, rows, ["region", "visit", "phase"], of_phases)
-    matrices = frame([*rows], f"{PLACE_COLUMNS} {_AT} {INTERVAL}").drop(columns="metric")
-    return matrices.assign(visit=matrices.visit.astype("Int64").replace(_INITIAL, pd.NA))
+    summaries = _summary(analysis, rows, ["region", "visit", "phase"], of_phases)
+    columns = f"{PLACE_COLUMNS} {_AT} {INTERVAL}".replace("visit:int64", "visit:Int64")
+    return frame([*summaries], columns).drop(columns="metric")
 
 
 @table("stream_references", "class_name:str reference:str region:str metric:str value")

@@ -183,7 +183,7 @@ def _missing(analysis: Analysis, part: RunKind) -> pd.DataFrame:
     both=True,
 )
 def _contrasts(analysis: Analysis, part: RunKind) -> Iterator[tuple[Any, ...]]:
-    first, keys = next(iter(part.axes), ""), [metric.key for metric in part.metrics]
+    first, keys = next(iter(part.classes), ""), [metric.key for metric in part.metrics]
     runs = part.runs
     base = runs.loc[runs.class_name == first, ["algorithm", "run", *keys]]
     pairs = runs[runs.class_name != first].merge(base, on=["algorithm", "run"], suffixes=("", "_0"))
@@ -193,7 +193,7 @@ def _contrasts(analysis: Analysis, part: RunKind) -> Iterator[tuple[Any, ...]]:
             if len(both):
                 seed = "contrast", algorithm, name, metric.key
                 level, before, *others = paired({"": both}, metric, analysis.bootstrap, *seed)
-                yield (name, algorithm, metric.key, part.axes[name], before, level, *others)
+                yield (name, algorithm, metric.key, part.classes[name].axis, before, level, *others)
 
 
 def paired(
