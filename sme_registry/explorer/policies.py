@@ -19,7 +19,7 @@ from sme_registry.errors import PolicyError, ResourceLimitError
 from sme_registry.evaluation import Perceptron, Policy
 from sme_registry.evaluation.models import ModulePredictor, OnnxNetwork
 from sme_registry.evaluation.policies import TeamPolicy
-from sme_registry.explorer.program import OPERATIONS, NetworkProgram, ProgramBuilder, point_width
+from sme_registry.explorer.program import OPERATIONS, NetworkProgram, point_width
 from sme_registry.export.networks import traced
 from sme_registry.io import is_installed
 from sme_registry.spec import SMESpec
@@ -39,15 +39,14 @@ def policy_program(policy: Policy | TeamPolicy, spec: SMESpec) -> NetworkProgram
 
     They are known if they equal the policy's own in probes in and outside the cube.
     """
-    build = ProgramBuilder(spec.observation_dim)
+    program = NetworkProgram(spec.observation_dim)
     try:
         if isinstance(policy, TeamPolicy):
-            _append_team(build, policy, spec)
+            _append_team(program, policy, spec)
         else:
-            _append(build, 0, policy)
+            _append(program, 0, policy)
     except (_UnknownNetwork, ResourceLimitError):
         return None
-    program = build.build()
     observations = probe_points(spec).astype(np.float32)
     expected, actions = (np.clip(act(observations), 0.0, 1.0) for act in (policy, program))
     # NaN counts as a difference.
@@ -62,47 +61,47 @@ def probe_points(spec: SMESpec) -> Array:
     return x
 
 
-def _append(build: ProgramBuilder, observation: int, policy: Policy) -> None:
+def _append(program: NetworkProgram, observation: int, policy: Policy) -> None:
     act: Any = policy.act
-    width = build.width(observation)
+    width = program.width_of(observation)
     perceptron = perceptron_of(policy)
     if perceptron is not None:
-        x = _append_perceptron(build, observation, perceptron)
+        x = _append_perceptron(program, observation, perceptron)
     else:
-        program = act if isinstance(act, NetworkProgram) else _exported(act, width)
-        if program is None or program.inputs != width:
+        network = act if isinstance(act, NetworkProgram) else _exported(act, width)
+        if network is None or network.inputs != width:
             raise _UnknownNetwork
-        x = build.append(program, observation)
+        x = program.append(network, observation)
     if policy.action_range == "symmetric":
-        build.affine(x, 0.5, 0.5)
+        program.affine(x, 0.5, 0.5)
 
 
-def _append_perceptron(build: ProgramBuilder, x: int, network: Perceptron) -> int:
+def _append_perceptron(program: NetworkProgram, x: int, network: Perceptron) -> int:
     for W, b, activation in network.layers:
-        x = build.dense(x, np.ascontiguousarray(W.T), b)
+        x = program.dense(x, np.ascontiguousarray(W.T), b)
         if activation == "silu":
-            x = build.binary("mul", x, build.unary("sigmoid", x))
+            x = program.binary("mul", x, program.unary("sigmoid", x))
         elif activation == "elu":
-            x = build.unary("elu", x, alpha=1.0)
+            x = program.unary("elu", x, alpha=1.0)
         elif activation != "identity":
-            x = build.unary(activation, x)
+            x = program.unary(activation, x)
     if network.low is not None and network.high is not None:
         half = 0.5 * (network.high.astype(np.float64) - network.low)
-        x = build.binary("add", build.binary("mul", x, half), network.low + half)
+        x = program.binary("add", program.binary("mul", x, half), network.low + half)
     return x
 
 
-def _append_team(build: ProgramBuilder, team: TeamPolicy, spec: SMESpec) -> None:
+def _append_team(program: NetworkProgram, team: TeamPolicy, spec: SMESpec) -> None:
     n = point_width(spec)
     actions = []
     for member in team.members:
         # What an agent sees of the joint observation is an affine map of these rows.
         nothing = member.observe(np.zeros((1, n), np.float32))[0]
         rows = member.observe(np.eye(n, dtype=np.float32)) - nothing
-        seen = build.dense(0, rows.T.copy(), nothing)
-        _append(build, seen, member.policy)
-        actions.append(build.columns(build.last, tuple(range(member.action_dim))))
-    build.concat(*actions)
+        seen = program.dense(0, rows.T.copy(), nothing)
+        _append(program, seen, member.policy)
+        actions.append(program.columns(program.last, tuple(range(member.action_dim))))
+    program.concat(*actions)
 
 
 def _exported(act: Any, width: int) -> NetworkProgram | None:
@@ -167,16 +166,16 @@ def program_of_graph(
     output: str,
     width: int,
 ) -> NetworkProgram | None:
-    build = ProgramBuilder(width)
+    program = NetworkProgram(width)
     values: dict[str, _Value] = {**constants, input: 0}
     try:
         for node in nodes:
             operands = [values[name] if name else None for name in node.inputs]
             (name,) = node.outputs
-            values[name] = _OPERATORS[node.operator](build, *operands, **node.attributes)
+            values[name] = _OPERATORS[node.operator](program, *operands, **node.attributes)
         # The output must be the newest value.
-        build.unary("clip", _number(build, values[output]), low=-1e300, high=1e300)
-        return build.build()
+        program.unary("clip", _number(program, values[output]), low=-1e300, high=1e300)
+        return program
     except (_UnknownNetwork, ResourceLimitError):
         return None
     except (KeyError, IndexError, TypeError, ValueError, OverflowError):  # not a valid graph
@@ -191,48 +190,49 @@ _FLOATS = (1, 11)  # TensorProto.FLOAT and DOUBLE
 _UNARY = ("Relu", "Tanh", "Sigmoid", "Softplus", "Erf", "Exp", "Sqrt", "Abs", "Neg")
 
 
-def _unary(op: str, build: ProgramBuilder, x: Any) -> _Value:
-    return build.unary(op, _data(x))
+def _unary(op: str, program: NetworkProgram, x: Any) -> _Value:
+    return program.unary(op, _data(x))
 
 
-def _leaking(op: str, build: ProgramBuilder, x: Any, *, alpha: Any) -> _Value:
-    return build.unary(op, _data(x), alpha=float(alpha))
+def _leaking(op: str, program: NetworkProgram, x: Any, *, alpha: Any) -> _Value:
+    return program.unary(op, _data(x), alpha=float(alpha))
 
 
-def _binary(op: str, build: ProgramBuilder, left: Any, right: Any) -> _Value:
+def _binary(op: str, program: NetworkProgram, left: Any, right: Any) -> _Value:
     if isinstance(left, int) or isinstance(right, int):
-        return build.binary(op, *(x if isinstance(x, int) else _row(x) for x in (left, right)))
+        return program.binary(op, *(x if isinstance(x, int) else _row(x) for x in (left, right)))
     return np.asarray(OPERATIONS[op](left, right))
 
 
-def _constant(build: ProgramBuilder, **value: Any) -> _Value:
+def _constant(program: NetworkProgram, **value: Any) -> _Value:
     ((name, number),) = value.items()
     if name not in ("value", "value_float", "value_floats", "value_int", "value_ints"):
         raise _UnknownNetwork
     return np.asarray(number)
 
 
-def _cast(build: ProgramBuilder, x: _Value, to: int, saturate: int = 1) -> _Value:
+def _cast(program: NetworkProgram, x: _Value, to: int, saturate: int = 1) -> _Value:
     if to not in _FLOATS:
         raise _UnknownNetwork
     return x
 
 
-def _flatten(build: ProgramBuilder, x: Any, axis: int = 1) -> _Value:
+def _flatten(program: NetworkProgram, x: Any, axis: int = 1) -> _Value:
     _check_last(axis)
     return _data(x)
 
 
-def _reshape(build: ProgramBuilder, x: Any, shape: Any, allowzero: int = 0) -> _Value:
+def _reshape(program: NetworkProgram, x: Any, shape: Any, allowzero: int = 0) -> _Value:
     """Only what leaves the rows of a value as they are."""
     rows, *columns = np.asarray(shape).tolist()
-    if columns not in ([build.width(_data(x))], [-1]) or rows not in (-1, 0) or rows == columns[0]:
+    width = program.width_of(_data(x))
+    if columns not in ([width], [-1]) or rows not in (-1, 0) or rows == columns[0]:
         raise _UnknownNetwork
     return _data(x)
 
 
 def _gemm(
-    build: ProgramBuilder,
+    program: NetworkProgram,
     x: Any,
     W: Any,
     b: Any = None,
@@ -248,13 +248,13 @@ def _gemm(
     offset = np.zeros(len(W), W.dtype)
     if b is not None:
         offset = offset + _row(b).astype(W.dtype) * W.dtype.type(beta)
-    if W.shape != (len(offset), build.width(_data(x))):
+    if W.shape != (len(offset), program.width_of(_data(x))):
         raise _UnknownNetwork
-    return build.dense(x, np.ascontiguousarray(W), offset)
+    return program.dense(x, np.ascontiguousarray(W), offset)
 
 
 def _clip(
-    build: ProgramBuilder,
+    program: NetworkProgram,
     x: Any,
     low: Any = None,
     high: Any = None,
@@ -264,16 +264,16 @@ def _clip(
     low, high = (
         _scalar(end if value is None else value) for value, end in ((low, min), (high, max))
     )
-    return build.unary("clip", _data(x), low=low, high=high)
+    return program.unary("clip", _data(x), low=low, high=high)
 
 
-def _concat(build: ProgramBuilder, *values: Any, axis: int) -> _Value:
+def _concat(program: NetworkProgram, *values: Any, axis: int) -> _Value:
     _check_last(axis)
-    return build.concat(*(_number(build, value) for value in values))
+    return program.concat(*(_number(program, value) for value in values))
 
 
 def _layer_normalization(
-    build: ProgramBuilder,
+    program: NetworkProgram,
     x: Any,
     scale: Any,
     shift: Any = None,
@@ -282,12 +282,12 @@ def _layer_normalization(
     stash_type: int = 1,
 ) -> _Value:
     _check_last(axis)
-    y = build.unary("normalise", _data(x), epsilon=float(epsilon))
-    y = build.binary("mul", y, _row(scale))
-    return y if shift is None else build.binary("add", y, _row(shift))
+    y = program.unary("normalise", _data(x), epsilon=float(epsilon))
+    y = program.binary("mul", y, _row(scale))
+    return y if shift is None else program.binary("add", y, _row(shift))
 
 
-def _transpose(build: ProgramBuilder, x: Any, perm: Sequence[int] = (1, 0)) -> _Value:
+def _transpose(program: NetworkProgram, x: Any, perm: Sequence[int] = (1, 0)) -> _Value:
     if list(perm) != [1, 0]:
         raise _UnknownNetwork
     return _matrix(x).T
@@ -298,13 +298,13 @@ _OPERATORS: dict[str, Callable[..., _Value]] = {
     **{name: partial(_binary, name.lower()) for name in ("Add", "Sub", "Mul", "Div")},
     "Elu": partial(_leaking, "elu", alpha=1.0),
     "LeakyRelu": partial(_leaking, "leaky_relu", alpha=0.01),
-    "Identity": lambda build, x: x,
+    "Identity": lambda program, x: x,
     "Cast": _cast,
     "Flatten": _flatten,
     "Reshape": _reshape,
     "Constant": _constant,
     "Gemm": _gemm,
-    "MatMul": lambda build, x, W: _gemm(build, x, W),
+    "MatMul": lambda program, x, W: _gemm(program, x, W),
     "Clip": _clip,
     "Concat": _concat,
     "LayerNormalization": _layer_normalization,
@@ -319,8 +319,8 @@ def _data(value: Any) -> int:
     return value
 
 
-def _number(build: ProgramBuilder, value: Any) -> int:
-    return value if isinstance(value, int) else build.constant(_row(value))
+def _number(program: NetworkProgram, value: Any) -> int:
+    return value if isinstance(value, int) else program.constant(_row(value))
 
 
 def _scalar(value: Any) -> float:

@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -62,41 +61,36 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class ProgramStep:
+class ProgramStep(NamedTuple):
     op: str  # one of those in the module's first lines
     inputs: tuple[int, ...]  # the values that it reads, by their numbers
     width: int  # columns of its value
     # arrays, numbers, or a tuple of columns, by the operation's names
     parameters: Mapping[str, Any]
 
-    def compute(self, values: list[Array]) -> Array:
-        """Its value `[B, width]`, from all earlier values."""
-        operands = [values[i] for i in self.inputs or (0,)]
-        parameters = {
-            name: value.astype(np.float64) if isinstance(value, np.ndarray) else value
-            for name, value in self.parameters.items()
-        }
-        return np.asarray(OPERATIONS[self.op](*operands, **parameters))
 
-
-@dataclass(frozen=True, eq=False)
 class NetworkProgram:
-    """A function from rows `[B, n]` to rows `[B, width]`; deterministic."""
+    """A function from rows `[B, n]` to rows `[B, width]`, deterministic, to which steps are added.
 
-    inputs: int  # n
-    steps: tuple[ProgramStep, ...]  # in order
+    The methods that add a step return the number of its value. `what` is for errors.
+    """
 
-    @property
-    def width(self) -> int:
-        return self.steps[-1].width if self.steps else self.inputs
+    def __init__(self, inputs: int, what: str = "network") -> None:
+        self.inputs, self._what = inputs, what
+        self.steps: list[ProgramStep] = []
+        self._weights = 0
 
     def __call__(self, x: npt.ArrayLike) -> Array:
         """The output `[B, width]` for inputs `[B, n]`."""
         values: list[Array] = [np.asarray(x, dtype=np.float64)]
         with np.errstate(all="ignore"):  # as in the script; the caller checks what comes out
             for step in self.steps:
-                values.append(step.compute(values))
+                operands = [values[i] for i in step.inputs or (0,)]
+                parameters = {
+                    name: value.astype(np.float64) if isinstance(value, np.ndarray) else value
+                    for name, value in step.parameters.items()
+                }
+                values.append(np.asarray(OPERATIONS[step.op](*operands, **parameters)))
         return values[-1]
 
     def to_dict(self) -> dict[str, Any]:
@@ -114,21 +108,16 @@ class NetworkProgram:
         ]
         return {"inputs": self.inputs, "steps": steps}
 
-
-class ProgramBuilder:
-    """A program under construction. Values are referred to by number; 0 is the input."""
-
-    def __init__(self, inputs: int, what: str = "network") -> None:
-        self.inputs, self._what = inputs, what
-        self._steps: list[ProgramStep] = []
-        self._weights = 0
-
     @property
     def last(self) -> int:
-        return len(self._steps)
+        return len(self.steps)
 
-    def width(self, value: int) -> int:
-        return self.inputs if value == 0 else self._steps[value - 1].width
+    @property
+    def width(self) -> int:
+        return self.width_of(self.last)
+
+    def width_of(self, value: int) -> int:
+        return self.inputs if value == 0 else self.steps[value - 1].width
 
     def dense(self, x: int, W: npt.NDArray[Any], b: npt.NDArray[Any]) -> int:
         return self._add("dense", (x,), len(b), W=W, b=b)
@@ -144,20 +133,23 @@ class ProgramBuilder:
 
     def columns(self, x: int, columns: tuple[int, ...]) -> int:
         """Some columns of a value; the value itself where they are all, in order."""
-        if columns == tuple(range(self.width(x))):
+        if columns == tuple(range(self.width_of(x))):
             return x
         return self._add("columns", (x,), len(columns), columns=columns)
 
     def concat(self, *values: int) -> int:
         if len(values) == 1:
             return values[0]
-        return self._add("concat", values, sum(map(self.width, values)))
+        return self._add("concat", values, sum(map(self.width_of, values)))
 
     def binary(self, op: str, left: int | npt.NDArray[Any], right: int | npt.NDArray[Any]) -> int:
         """`add`, `sub`, `mul` or `div` of values, or of a value and a row `[m]` or `[1]`."""
         if not isinstance(left, int):
             left = self.constant(left)
-        widths = [self.width(left), self.width(right) if isinstance(right, int) else len(right)]
+        widths = [
+            self.width_of(left),
+            self.width_of(right) if isinstance(right, int) else len(right),
+        ]
         if 1 not in widths and widths[0] != widths[1]:
             raise ValueError(f"{op} of widths {widths}")
         if isinstance(right, int):
@@ -165,7 +157,7 @@ class ProgramBuilder:
         return self._add(op, (left,), max(widths), v=right)
 
     def unary(self, op: str, x: int, **numbers: float) -> int:
-        return self._add(op, (x,), self.width(x), **numbers)
+        return self._add(op, (x,), self.width_of(x), **numbers)
 
     def affine(self, x: int, scale: float, shift: float) -> int:
         return self.binary("add", self.binary("mul", x, np.array([scale])), np.array([shift]))
@@ -178,9 +170,6 @@ class ProgramBuilder:
             numbers.append(self._add(step.op, inputs, step.width, **step.parameters))
         return numbers[-1]
 
-    def build(self) -> NetworkProgram:
-        return NetworkProgram(self.inputs, tuple(self._steps))
-
     def _add(self, op: str, inputs: tuple[int, ...], width: int, **parameters: Any) -> int:
         self._weights += sum(np.size(v) for v in parameters.values() if isinstance(v, np.ndarray))
         if width > MAX_WIDTH or self._weights > MAX_WEIGHTS:
@@ -188,7 +177,7 @@ class ProgramBuilder:
                 f"{self._what}: has more than {MAX_WEIGHTS:,} weights, or a layer of more than "
                 f"{MAX_WIDTH:,} units: too large for a page. Use `sme evaluate` or `sme diagnose`."
             )
-        self._steps.append(ProgramStep(op, inputs, width, parameters))
+        self.steps.append(ProgramStep(op, inputs, width, parameters))
         return self.last
 
 
@@ -207,53 +196,53 @@ def point_width(spec: SMESpec) -> int:
 def optimal(task: Task) -> NetworkProgram:
     """π* of a point; of a team, each agent's from what it observes."""
     spec = task.spec
-    build = ProgramBuilder(point_width(spec), "π*")
+    program = NetworkProgram(point_width(spec), "π*")
     actions = [
-        build.layers(build.columns(0, tuple(observed)), layers)
+        program.layers(program.columns(0, tuple(observed)), layers)
         for observed, layers in zip(task.observed, task.policies, strict=True)
     ]
-    build.concat(*actions)
-    return build.build()
+    program.concat(*actions)
+    return program
 
 
 def limit(task: Task) -> NetworkProgram | None:
     """ℓ(s) = 1 − 2τ v(s) of a point; None without safety."""
     if task.spec.safety is None:
         return None
-    build = ProgramBuilder(point_width(task.spec), "the network of the limits")
-    v = build.layers(build.columns(0, tuple(range(task.spec.state_dim))), task.limiting)
-    build.affine(v, -2.0 * task.spec.safety.tightness, 1.0)
-    return build.build()
+    program = NetworkProgram(point_width(task.spec), "the network of the limits")
+    v = program.layers(program.columns(0, tuple(range(task.spec.state_dim))), task.limiting)
+    program.affine(v, -2.0 * task.spec.safety.tightness, 1.0)
+    return program
 
 
 def observe(task: Task) -> NetworkProgram:
     """What the policy sees in a point, rounded to float32."""
     spec = task.spec
     n = spec.state_dim + spec.distractors
-    build = ProgramBuilder(point_width(spec), "the mixing")
+    program = NetworkProgram(point_width(spec), "the mixing")
     x = 0
     if spec.mixing != "none":
-        x = build.columns(0, tuple(range(n)))
+        x = program.columns(0, tuple(range(n)))
         if spec.mixing == "orthogonal":
             ((W, b),) = task.mixing
-            x = build.dense(x, W, b)
+            x = program.dense(x, W, b)
         else:
-            x = build.layers(x, task.mixing)
-        x = build.concat(x, build.columns(0, (n, n + 1)))
-    build.unary("round32", x)
-    return build.build()
+            x = program.layers(x, task.mixing)
+        x = program.concat(x, program.columns(0, (n, n + 1)))
+    program.unary("round32", x)
+    return program
 
 
 def linear(task: Task, fitted: References) -> NetworkProgram:
     """The linear least-squares policy of a report, of a point."""
-    build = ProgramBuilder(point_width(task.spec), "the linear policy")
-    s = build.columns(0, tuple(range(task.spec.state_dim)))
-    build.dense(s, fitted.slope.T.copy(), fitted.intercept - 0.5 * fitted.slope.sum(axis=0))
-    return build.build()
+    program = NetworkProgram(point_width(task.spec), "the linear policy")
+    s = program.columns(0, tuple(range(task.spec.state_dim)))
+    program.dense(s, fitted.slope.T.copy(), fitted.intercept - 0.5 * fitted.slope.sum(axis=0))
+    return program
 
 
 def constant(task: Task, action: Array) -> NetworkProgram:
     """One action `[A]` in every point."""
-    build = ProgramBuilder(point_width(task.spec), "the constant policy")
-    build.constant(action)
-    return build.build()
+    program = NetworkProgram(point_width(task.spec), "the constant policy")
+    program.constant(action)
+    return program

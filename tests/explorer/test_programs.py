@@ -10,7 +10,7 @@ from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.explorer import policies, program
 from sme_registry.explorer.policies import GraphNode, program_of_graph
-from sme_registry.explorer.program import MAX_WEIGHTS, MAX_WIDTH, ProgramBuilder
+from sme_registry.explorer.program import MAX_WEIGHTS, MAX_WIDTH, NetworkProgram
 from tests.explorer.networks import arrays, observations, offline, perceptron
 
 SPEC = SMESpec(state_dim=3, action_dim=2)
@@ -181,12 +181,12 @@ def test_a_graph_cannot_grow_without_end():
 
 
 def test_a_network_too_large_for_a_page_is_refused():
-    build = ProgramBuilder(3, "this")
+    wide = NetworkProgram(3, "this")
     W = np.zeros((8, MAX_WEIGHTS // 16))
-    build.dense(0, W, np.zeros(8))
+    wide.dense(0, W, np.zeros(8))
     with pytest.raises(ResourceLimitError, match=f"this: has more than {MAX_WEIGHTS:,}"):
-        build.dense(0, W, np.zeros(8))
+        wide.dense(0, W, np.zeros(8))
     with pytest.raises(ResourceLimitError, match="too large for a page"):
-        ProgramBuilder(3).constant(np.zeros(MAX_WIDTH + 1))
+        NetworkProgram(3).constant(np.zeros(MAX_WIDTH + 1))
     with pytest.raises(ValueError, match="widths"):
-        ProgramBuilder(3).binary("add", 0, np.zeros(2))
+        NetworkProgram(3).binary("add", 0, np.zeros(2))
