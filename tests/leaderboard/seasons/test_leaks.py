@@ -1,5 +1,6 @@
 """Before the reveal nothing that a server writes or answers holds what only the master tells."""
 
+import http.client
 import logging
 import pickle
 
@@ -9,16 +10,15 @@ import pytest
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.scoring.worker import Work, run_scorer
-from leaderboard.seasons.entrant import signer_of
 from leaderboard.seasons.scoring import instances
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Sessions
 from sme_registry import SMEError, materialize, seasons
+from sme_registry.errors import SealedError
 from sme_registry.seasons import wire
-from sme_registry.seasons.transcript import Chain, answers_head, challenge_head, next_head
 from tests.leaderboard.seasons.playing import LANES, online_board, playing, request, scored
 from tests.leaderboard.seasons.sealing import MASTER
-from tests.leaderboard.serving import receiver, serving
+from tests.leaderboard.serving import serving
 
 KEY = SigningKey.generate()
 
@@ -39,71 +39,56 @@ def secrets_of(board, store):
     return [*(text.encode() for text in texts), *raw]
 
 
-def everything(url, board, client):
-    """The answers to every request of an entrant, and to a refused one of each kind."""
-    signed = board.request(KEY).for_receiver(receiver(url), KEY)
-    started = board.send(url, signed, KEY)
-    yield started
-    ticket = seasons.Ticket.from_dict(started.json())
-    signer = signer_of(signed, KEY)
-    assert signer is not None
-    token = {"Authorization": f"Bearer {ticket.token}"}
+def play(url, board):
+    """Every request of an entrant, and a refused one of each kind."""
+    ticket = board.ticket(url, KEY)
+    at = wire.ticket_path(board.season.id, ticket.ticket)
+    connection = wire.Connection(url, ticket.token)
 
-    def at(action):
-        return url + wire.instance_path(board.season.id, 1, 0, action)
+    def refused(method, action, body=b""):
+        with pytest.raises(SealedError):
+            connection.request(method, f"{at}/{action}", body)
 
-    def step(number, value=0.5):
-        return client.post(at("steps"), content=request(number, value), headers=token)
-
-    yield client.get(f"{url}/api/seasons")
-    yield client.get(f"{url}/api/seasons/{board.season.id}")
-    yield client.get(f"{url}/api/log")
-    yield client.get(url + wire.ticket_path(board.season.id, 1))
-    chain = Chain(request=signed.id, ticket=1, instance=0)
-    started = client.post(at("start?lanes=4"), headers=token)
-    yield started
-    head = chain.first_head(4, started.content)
-    for number in range(1, 17):
-        answer = step(number)
-        yield answer
-        head = next_head(head, request(number, 0.5), answer.content)
-    yield from (step(1), step(18), step(17), step(16, np.nan), step(16, 0.1))
-    yield client.post(at("steps"), content=b"x", headers=token)
-    yield client.post(at("start?lanes=5"), headers=token)
-    yield client.post(at("start?lanes=x"), headers=token)
-    yield client.get(at("challenge"), headers=token)
-    yield client.post(at("finish"), headers=token)
-    yield client.post(at(f"finish?signature={signer.sign(chain.at(16, head))}"), headers=token)
-    challenge = client.get(at("challenge"), headers=token)
-    yield challenge
-    yield client.put(at("answers"), content=b"x", headers=token)
-    answers = wire.pack_table(np.full((300, 1), 0.5))
-    yield client.put(at("answers"), content=answers, headers=token)
-    head = answers_head(challenge_head(head, challenge.content), answers)
-    last = f"answers?signature={signer.sign(chain.at(18, head))}"
-    yield client.put(at(last), content=answers, headers=token)
-    yield client.post(url + wire.ticket_path(board.season.id, 1) + "/end", headers=token)
-    yield client.get(url + wire.ticket_path(board.season.id, 1), headers=token)
+    with seasons.Instance(url, ticket, lanes=LANES) as instance:
+        instance.begin()
+        for _ in range(16):
+            instance.step(np.full((LANES, 1), 0.5, np.float32))
+        for body in (request(1), request(18), request(17), request(16, np.nan), b"x"):
+            refused("POST", "instances/0/steps", body)
+        for lanes in ("5", "x"):
+            refused("POST", f"instances/0/start?lanes={lanes}")
+        refused("GET", "instances/0/challenge")
+        refused("POST", "instances/0/finish")
+        answers = np.full((len(instance.challenge()), 1), 0.5)
+        for body in (b"x", wire.pack_table(answers)):
+            refused("PUT", "instances/0/answers", body)
+        refused("POST", "end")
+        instance.send_answers(answers)
+        instance.status()
+    for path in ("", f"/{board.season.id}", f"/{board.season.id}/ranking"):
+        connection.request("GET", f"/api/seasons{path}")
+    connection.request("GET", "/api/log")
 
 
-def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
+def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog, monkeypatch):
     board = online_board(tmp_path)
-    answered = []
+    answered, statuses, read = [], set(), http.client.HTTPResponse.read
 
-    def record(answer):
-        answered.append(answer.read())
-        answered.extend(b": ".join(header) for header in answer.headers.raw)
+    def recorded(answer, *arguments):
+        data = read(answer, *arguments)
+        answered.extend([data, str(answer.headers).encode()])
+        statuses.add(answer.status)
+        return data
 
+    monkeypatch.setattr(http.client.HTTPResponse, "read", recorded)
     with (
         caplog.at_level(logging.DEBUG),
         serving(board.path, season_secrets=[board.secret]) as url,
-        httpx.Client(event_hooks={"response": [record]}, timeout=60.0) as client,
     ):
-        statuses = [each.status_code for each in everything(url, board, client)]
-    assert set(statuses) == {200, 201, 400, 403, 409, 422}
+        play(url, board)
+    assert statuses == {200, 201, 400, 403, 409, 422}
     with SeasonStore.open(board.path) as store:
-        result = scored(store, board.season, 1)
-        store.finish(result)
+        store.finish(scored(store, board.season, 1))
         searched = secrets_of(board, store)
     parts = {f"answer {i}": part for i, part in enumerate(answered)}
     parts["log"] = caplog.text.encode()

@@ -118,27 +118,16 @@ def test_read_only_opening_writes_nothing(tmp_path, key):
     assert left - set(names) <= {"index.sqlite-wal", "index.sqlite-shm"}
 
 
-@pytest.mark.parametrize("killed", [False, True], ids=["after closing", "after a kill"])
-def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
+def test_a_board_on_a_read_only_disk_is_read(tmp_path, key):
     with small_disk(tmp_path / "disk", "4m") as disk:
         if disk is None:
             if os.geteuid() == 0:
                 pytest.skip("root may neither mount here nor be kept from writing by modes")
             disk = tmp_path / "disk"
-        store = tiny_board(disk / "board")
-        fill(store, key, waiting=True)
-        if killed:  # the last writes are then only in the write-ahead log
-            child = fork()
-            if child == 0:
-                other = Store.open(disk / "board")
-                put_submission(other, key, 7)
-                os._exit(0)
-            os.waitpid(child, 0)
-            shutil.copytree(disk / "board", disk / "killed")
-        expected = derived(store)
-        store.close()
-        board = disk / ("killed" if killed else "board")
-        assert (board / "index.sqlite-wal").exists() == killed
+        board = disk / "board"
+        with tiny_board(board) as store:
+            fill(store, key, waiting=True)
+            expected = derived(store)
         if disk.is_mount():
             make_read_only(disk)
         else:
@@ -147,8 +136,6 @@ def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
         with pytest.raises(OSError, match=r"denied|ead-only"):
             (board / "new").touch()
         with Store.open(board, read_only=True) as read:
-            assert len(read.entries()) == (5 if killed else 4)
-            assert read.result(read.entries()[0].id) is not None
             assert derived(read) == expected
         with pytest.raises(BoardError):
             Store.open(board)
