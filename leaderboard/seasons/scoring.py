@@ -238,7 +238,7 @@ def season_rankings(
 ) -> dict[Knowledge, list[RankedRow]]:
     """The rankings of a season's methods with results, one for each declared knowledge."""
     rows = [row for row in counting(store, season) if row.result is not None]
-    entries = list(_methods(store, season, rows).values())
+    entries = list(_methods(store, season, rows))
     return {
         knowledge: ranking([each for each in entries if each.knowledge == knowledge], metric)
         for knowledge in KNOWLEDGE
@@ -288,16 +288,13 @@ def _read(store: SeasonStore, instance: HiddenTask, answer: Artefact | None) -> 
     return read_answers(data, instance.spec, instance.protocol), answer.sha256
 
 
-def _methods(
-    store: SeasonStore, season: Season, rows: Iterable[SealedRow]
-) -> dict[tuple[str, str], EntryRow]:
+def _methods(store: SeasonStore, season: Season, rows: Iterable[SealedRow]) -> Iterator[EntryRow]:
     """A row for each key and method; those of several tickets are scored over all their runs."""
     groups: dict[tuple[str, str], list[SealedRow]] = {}
     for row in rows:
         groups.setdefault(row.attempt, []).append(row)
-    entries = {}
     fewest = min(member.instances for member in season.classes)
-    for attempt, members in groups.items():
+    for members in groups.values():
         entry: EntryRow = members[-1]
         if len(members) > 1:
             scores, oracle_like = _score_together(store, season.digest, tuple(members))
@@ -310,8 +307,7 @@ def _methods(
                 oracle_like=oracle_like,
             )
         enough = fewest * len(members) >= store.document.runs_to_rank
-        entries[attempt] = replace(entry, enough_runs=enough)
-    return entries
+        yield replace(entry, enough_runs=enough)
 
 
 @functools.lru_cache(1024)  # a bootstrap, which every page of the season shows

@@ -173,7 +173,9 @@ class Season(Document):
     commitment: Digest
 
     @model_validator(mode="after")
-    def _classes_fit(self) -> Self:
+    def _classes_and_times_fit(self) -> Self:
+        if self.opens >= self.closes:  # as text: the form is fixed
+            raise ValueError(f"closes={self.closes}: must be after opens={self.opens}.")
         names = [member.name for member in self.classes]
         if len(set(names)) < len(names):
             raise ValueError(f"classes={names}: must have different names. Rename one.")
@@ -215,12 +217,6 @@ class Season(Document):
         except ValueError as error:
             raise ValueError(f"{value}: is no date ({error}). Correct it.") from None
         return value
-
-    @model_validator(mode="after")
-    def _times_are_ordered(self) -> Self:
-        if self.opens >= self.closes:  # as text: the form is fixed
-            raise ValueError(f"closes={self.closes}: must be after opens={self.opens}.")
-        return self
 
     @field_validator("protocol")
     @classmethod

@@ -140,10 +140,6 @@ def test_bad_entries_are_refused_with_stable_codes(store, key):
     assert refused(store, entry(store, key, None, None, submitter=unsafe)) == "unsafe_name"
     reserved = {"name": "the board", "key": key.public}
     assert refused(store, entry(store, key, None, None, submitter=reserved)) == "unsafe_name"
-    elsewhere = signed_entry(store, tiny_season(id="elsewhere"), key, [None, None])
-    assert refused(store, elsewhere) == "season_unknown"
-    unbound = entry(store, key, None, None).content.signed(key)
-    assert refused(store, unbound) == "wrong_board"
     name = {"submitter": {"name": "Ada", "key": key.public}}
     assert send(store, entry(store, key, None, None, **name))
     name["submitter"]["key"] = other.public
