@@ -722,7 +722,7 @@ class TestTrain:
         assert printed["run"]["spec"]["k"] == 2
         assert "sets it, too" in refused(*SHORT, *file, "--set", "gamma=0.8")
 
-    def test_a_team_is_trained_with_its_regret_shown_and_its_model_evaluated(self, tmp_path):
+    def test_a_team_is_trained_with_its_regret_shown(self):
         command = ("train", "SME/Team2-v1", "-n", "300", "--set", "horizon=20", *QUICK)
         result = good(*command, "--out", "run", "--json")
         printed = json.loads(result.stdout)
@@ -730,12 +730,6 @@ class TestTrain:
         assert (printed["run"]["agents"], printed["run"]["steps_done"]) == (2, 1024)
         assert "training PPO: 1,024 of 1,024 steps" in result.stderr
         assert "team's mean regret" in result.stderr
-        header = (tmp_path / "run/episodes.csv").read_text().splitlines()[0]
-        assert header.endswith(",regret/agent_0,regret/agent_1")
-        again = good(
-            "evaluate", "run/model.zip", "Team2", "--set", "horizon=20", *QUICK, "--json"
-        ).stdout
-        assert json.loads(again)["agents"] == printed["evaluation"]["agents"]
         assert "shape" in refused("evaluate", "run/model.zip", "Team4", *QUICK)
         assert "shape" in refused("evaluate", "run/model.zip", "Default", *QUICK)
 

@@ -321,21 +321,6 @@ def log_episode(logger: Any, episode: Episode, agents: Sequence[str] = ()) -> No
         logger.record_mean(f"rollout/{name}", value)
 
 
-def episodes_of(env: Any, steps: int = 0, **options: Any) -> Episodes:
-    """`Episodes` for a `VecEnv` of our environments, after so many steps."""
-    agents = max(1, len(getattr(env, "agents", ())))
-    spec = lambda: env.get_attr("sme_spec")[0]  # noqa: E731
-    return Episodes(env.num_envs // agents, agents, spec, steps=steps, **options)
-
-
-def finished_in(
-    episodes: Episodes, rewards: Any, dones: Any, infos: Sequence[dict[str, Any]]
-) -> list[Episode]:
-    """Add a step of a `VecEnv`; returns the episodes that ended in it."""
-    terminated = [not info.get("TimeLimit.truncated", False) for info in infos]
-    return episodes.add(rewards, info_of_envs(infos), terminated, dones)
-
-
 class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
     """Logs the exact regret of each finished episode: its mean over the episode, not its last step.
 
@@ -367,15 +352,18 @@ class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # unty
     def _on_training_start(self) -> None:
         # A second `learn` without a reset continues the present episodes.
         if self._sums is None or self.locals.get("reset_num_timesteps", True):
-            agents = getattr(self.training_env, "agents", ())
-            self._agents = agents if len(agents) > 1 else ()
-            steps = int(self.model.num_timesteps) // max(1, len(agents))
-            self._sums = episodes_of(self.training_env, steps)
+            env: Any = self.training_env
+            agents = getattr(env, "agents", ())
+            self._agents, n = agents if len(agents) > 1 else (), max(1, len(agents))
+            steps = int(self.model.num_timesteps) // n
+            spec = lambda: env.get_attr("sme_spec")[0]  # noqa: E731
+            self._sums = Episodes(env.num_envs // n, n, spec, steps=steps)
 
     def _on_step(self) -> bool:
         assert self._sums is not None
-        step = (self.locals[name] for name in ("rewards", "dones", "infos"))
-        for episode in finished_in(self._sums, *step):
+        rewards, dones, infos = (self.locals[name] for name in ("rewards", "dones", "infos"))
+        terminated = [not info.get("TimeLimit.truncated", False) for info in infos]
+        for episode in self._sums.add(rewards, info_of_envs(infos), terminated, dones):
             self.episodes.append(episode._replace(episode=len(self.episodes) + 1))
             log_episode(self.logger, episode, self._agents)
         return True

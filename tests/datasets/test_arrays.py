@@ -48,12 +48,6 @@ def test_the_digest_covers_every_array_its_name_type_and_shape(fragile):
     assert len({fragile.digest, swapped.digest, wider.digest}) == 3
 
 
-def test_ends_delimit_the_trajectories(fragile):
-    lengths = np.diff([0, *fragile.ends])
-    np.testing.assert_array_equal(np.bincount(fragile.episodes), lengths)
-    assert fragile.ends[-1] == len(fragile) == 250
-
-
 def test_d3rlpy_gets_aligned_rows(fragile):
     given = to_d3rlpy(fragile)
     assert {len(array) for array in given.values()} == {250}

@@ -86,12 +86,6 @@ def test_a_data_set_has_exactly_n_transitions_and_its_last_is_a_timeout(count):
     assert len(data.ends) == -(-count // 100)
 
 
-def test_a_larger_data_set_begins_with_the_smaller_one():
-    few, many = collected(recipe(transitions=150)), collected(recipe(transitions=600))
-    np.testing.assert_array_equal(few.states, many.states[:150])
-    np.testing.assert_array_equal(few.actions, many.actions[:150])
-
-
 def test_starts_alpha_and_noise_use_separate_streams_of_the_data_seed():
     of = recipe(seed=5, transitions=300)
     data, task = collected(of), materialize(of.spec)
@@ -103,12 +97,6 @@ def test_starts_alpha_and_noise_use_separate_streams_of_the_data_seed():
     assert collected(of).digest == data.digest
     other = collected(recipe(seed=6, transitions=300))
     assert not np.isin(data.states[::100, 0], other.states[:, 0]).any()
-
-
-def test_nu_zero_is_the_optimum_to_the_rounding_of_its_actions():
-    data = collected(recipe(acting=[(0.0, 1.0)]))
-    np.testing.assert_array_equal(data.actions, data.optimal_actions.astype(np.float32))
-    assert data.regrets.max() < 1e-6
 
 
 def test_random_actions_are_uniform_and_drawn_at_every_step():

@@ -112,17 +112,6 @@ def test_invalid_input_gives_one_line_and_writes_nothing(arguments, message, tmp
     assert not (tmp_path / "minari").exists()
 
 
-def test_an_existing_data_set_is_kept_without_force():
-    good("make", "Default", "-n", "50")
-    assert "already exists, with the same recipe. Give" in refused("make", "Default", "-n", "50")
-    for options in (["-n", "60"], ["-n", "50", "--coverage", "0"]):
-        message = refused("make", "Default", *options)
-        assert "already exists, with another recipe. Give" in message
-        assert "--force to replace it" in message
-    good("make", "Default", "-n", "60", "--force")
-    assert open_dataset("sme/Default-v1-nu50-seed0-v0").recipe.transitions == 60
-
-
 def test_a_copy_under_another_name_is_neither_listed_nor_valid(tmp_path):
     good("make", "Default", "-n", "50")
     own = "sme/Default-v1-nu50-seed0-v0"

@@ -250,6 +250,9 @@ class TestAnExistingSet:
         before = (copied / NAME / "data" / "main_data.hdf5").read_bytes()
         with pytest.raises(NameTakenError, match=r"already exists, with another .*--name"):
             make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied)
+        same = {"mix": [(0.5, 0.5), ("random", 0.5)], "transitions": 250, "seed": 7}
+        with pytest.raises(NameTakenError, match="already exists, with the same recipe"):
+            make_dataset("Default", **same, name=NAME, folder=copied)
         edited(copied, lambda data: data["sme"].update(recipe_digest="sha256:" + "0" * 64))
         with pytest.raises(NameTakenError, match=r"already exists\. Give another --name"):
             make_dataset("Default", transitions=10, name=NAME, folder=copied)  # cannot be opened

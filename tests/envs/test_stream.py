@@ -12,7 +12,6 @@ from sme_registry.errors import (
     ActionError,
     EpisodeError,
     OptionError,
-    ResourceLimitError,
     UnexpectedKeywordError,
 )
 from sme_registry.testing import expect_same, next_action
@@ -188,11 +187,6 @@ def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make):
         make("SME/Switch5-v1", cycles=2)
     with pytest.raises(UnexpectedKeywordError, match=r"Did you mean 'action_range'"):
         make("SME/Switch5-v1", action_rnge="unit")
-
-
-def test_a_batch_that_does_not_fit_in_memory_is_refused():
-    with pytest.raises(ResourceLimitError, match="fewer environments"):
-        SMEVectorEnv(stream(), 2**40)
 
 
 def test_frames_show_the_task_in_force():

@@ -162,13 +162,6 @@ def test_a_fingerprint_holds_limits_distractors_and_what_is_seen(field):
         check_fingerprint(Fingerprint.from_dict(foreign), plain)
 
 
-def test_a_fingerprint_without_these_parts_is_what_it_was_before_they_existed():
-    fields = fingerprint_of(materialize(SMESpec())).to_dict()
-    assert list(fields) == ["optimal_action", "next_state"]
-    noise = SMESpec(observation={"distractors": 2})
-    assert fingerprint_of(materialize(noise)).to_dict() == fields
-
-
 def test_one_bad_file_does_not_spoil_the_equal_spec_from_elsewhere(saved):
     spec = SMESpec(state_dim=3, action_dim=2, seed=987)
     good = sme_registry.save(spec, saved.with_name("good.json"))

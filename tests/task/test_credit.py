@@ -39,15 +39,6 @@ def test_regret_shares_add_up_to_the_teams_regret_and_none_is_negative(spec, see
     assert task.difference_rewards(s[0], a[0]).shape == gains[0].shape
 
 
-@given(specs())
-def test_at_the_optimum_nobody_is_charged_and_nobody_could_gain(spec):
-    task = materialize(spec)
-    s = np.random.default_rng(0).random((20, spec.state_dim))
-    best = task.optimal_action(s)
-    np.testing.assert_array_equal(task.regret_shares(s, best), 0.0)
-    np.testing.assert_array_equal(task.difference_rewards(s, best), 0.0)
-
-
 def test_who_acts_optimally_is_charged_nothing_and_the_other_everything():
     task, s, a = drawn(TRIO)
     best = task.optimal_action(s)

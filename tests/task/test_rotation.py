@@ -14,8 +14,6 @@ from sme_registry.errors import ActionError, StateError
 from sme_registry.task import draw, materialize
 from tests.strategies import SAFETY, spec_fields
 
-EVEN = st.sampled_from([2, 8, 32])
-ANGLES = st.floats(0.0, 6.28)
 TEAM = {
     "agents": [
         {"action_dim": 1, "observes": [0, 3]},
@@ -28,17 +26,6 @@ TEAM = {
 def rotation(theta, state_dim, seed=0):
     spec = SMESpec(state_dim=state_dim, seed=seed).model_copy(update={"rotation": theta})
     return draw._rotation(spec, "policy/0/rotation", state_dim)
-
-
-@given(EVEN, ANGLES, ANGLES, st.integers(0, 5))
-def test_with_even_dimension_pre_activations_correlate_with_the_cosine(S, theta, other, seed):
-    spec = SMESpec(state_dim=S, complexity=2, seed=seed)
-    one, two = (materialize(spec.derive(rotation=angle)).layers[0].W for angle in (theta, other))
-    # Of isotropic inputs, such as uniform states: w · R w / (|w| |R w|) of each neuron.
-    correlation = (
-        (one * two).sum(axis=1) / np.linalg.norm(one, axis=1) / np.linalg.norm(two, axis=1)
-    )
-    np.testing.assert_allclose(correlation, math.cos(theta - other), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("S", [2, 5, 8])
