@@ -1,6 +1,6 @@
 """The figures of a diagnosis: by channel, state and time; of a team by agent; of a life by visit.
 
-`sme evaluate` draws the shells, limits, distractors and layers, and what a life retains.
+`sme evaluate` draws the shells, limits, distractors and layers, and what a life costs and retains.
 """
 
 from __future__ import annotations
@@ -38,7 +38,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST = 32  # channels or agents in one panel
-_FRESH = "fresh agent of the phase"
+_OF_NETWORKS = {
+    "inactive_units": "inactive hidden units, share",
+    "effective_rank": "effective rank of the last hidden layer",
+    "weight_norm": "norm of the weights",
+}
+_RANKING = "ranking by the critic, share"
 _REGRET = "normalised regret  (0 = optimal)"
 
 
@@ -66,20 +71,15 @@ def _reference(axes: Axes, value: float, name: str) -> None:
     draw_reference(axes, name, None, value, LABELS[name])
 
 
-def _bars(
-    axes: Axes, x: Any, groups: Mapping[str, Sequence[float | None]], beside: str = ""
-) -> None:
+def _bars(axes: Axes, x: Any, groups: Mapping[str, Sequence[float]], beside: str) -> None:
     """Bars of each group side by side at the places x; those of the group `beside` are hatched."""
     width = 0.8 / len(groups)
     for index, (label, values) in enumerate(groups.items()):
-        heights = np.array(values, dtype=float)  # none where a value is None
         style: dict[str, Any] = {"color": COLOURS[index]}
         if label == beside:
             style = {"color": "white", "hatch": "////"}
-        axes.bar(
-            np.asarray(x) + (index - (len(groups) - 1) / 2) * width, heights, width,
-            label=label, edgecolor=GREY, **style,
-        )  # fmt: skip
+        places = np.asarray(x) + (index - (len(groups) - 1) / 2) * width
+        axes.bar(places, values, width, label=label, edgecolor=GREY, **style)
 
 
 def _legends(*panels: Axes) -> None:
@@ -218,28 +218,6 @@ def _agents(diagnosis: TeamDiagnosis, figure: Figure) -> None:
         legend_above(axes)
 
 
-def _which_phases(diagnosis: StreamDiagnosis, figure: Figure) -> None:
-    left, right = figure.subplots(1, 2)
-    visits, phases = diagnosis.visits, diagnosis.phases
-    _bars(left, range(len(visits)), {"this life": [visit.online_regret for visit in visits]})
-    _draw_fresh(left, [phases[visit.phase].fresh_online_regret for visit in visits])
-    tick_visits(left, cast(Any, visits))
-    left.set(xlabel="visit of phase", ylabel="online regret of the visit, mean of 1 − r")
-    regrets = {
-        "after its best visit": [phase.best_normalised_regret for phase in phases],
-        "at the end of the life": [phase.final_normalised_regret for phase in phases],
-    }
-    _bars(right, range(len(phases)), regrets)
-    _draw_fresh(right, [phase.fresh_normalised_regret for phase in phases])
-    right.axhline(1.0, color=GREY, linewidth=0.9, linestyle=(0, (4, 4)), label="constant ½")
-    every = -(-len(phases) // 15)
-    right.set_xticks(range(0, len(phases), every), [str(phase.phase) for phase in phases[::every]])
-    right.set(xlabel="phase", ylabel=_REGRET)
-    for axes in (left, right):
-        axes.set_ylim(bottom=0.0)
-        legend_above(axes)
-
-
 def _critic(diagnosis: TaskDiagnosis, figure: Figure) -> None:
     """Nothing without a critic; only its level where it values states, and its ranking for IQL."""
     report = diagnosis.measurements.critic
@@ -276,43 +254,35 @@ def _draw_levels(axes: Axes, report: CriticReport) -> None:
     axes.set(xlabel="t/T", ylabel="discounted value")
 
 
-def _draw_fresh(axes: Axes, values: Sequence[float | None]) -> None:
-    """A stroke across each place, of its fresh agent, where all of them are known."""
-    x = np.arange(len(values))
-    if None not in values:
-        numbers = np.array(values, float)
-        axes.hlines(numbers, x - 0.45, x + 0.45, color="black", linewidth=1.6, label=_FRESH)
-
-
 def _network_by_visit(diagnosis: StreamDiagnosis, figure: Figure) -> None:
     """Nothing where no network is known."""
-    quantities = {
-        "inactive_units": "inactive hidden units, share",
-        "effective_rank": "effective rank of the last hidden layer",
-        "weight_norm": "norm of the weights",
-    }
-    networks = [visit.network for visit in diagnosis.visits]
+    visits, initial = diagnosis.visits, diagnosis.initial_network is not None
+    networks = [visit.network for visit in visits]
     if not any(networks):
         return
-    initial = diagnosis.initial_network is not None
     if initial:
         networks.insert(0, diagnosis.initial_network)
-    alone = [diagnosis.phases[visit.phase].fresh_network for visit in diagnosis.visits]
-    x = np.arange(len(networks)) - initial
-    rankings = [visit.critic_ranking for visit in diagnosis.visits]
-    ranked = any(ranking is not None for ranking in rankings)
-    panels = figure.subplots(1, len(quantities) + ranked).tolist()
-    if ranked:
-        last = panels.pop()
-        _lines(last, [visit.visit for visit in diagnosis.visits], {"this life": rankings})
-        last.axhline(0.5, color=GREY, linewidth=1.1)  # chance
-        tick_visits(last, cast(Any, diagnosis.visits))
-        last.set(ylabel="ranking by the critic, share", ylim=(0.0, 1.0))
-    for axes, (quantity, name) in zip(panels, quantities.items(), strict=True):
-        life, fresh = ([getattr(n, quantity, None) for n in group] for group in (networks, alone))
-        _lines(axes, x, {"this life": life})
-        _draw_fresh(axes, fresh)
-        tick_visits(axes, cast(Any, diagnosis.visits), initial=initial)
+    alone = [diagnosis.phases[visit.phase].fresh_network for visit in visits]
+    series: dict[str, tuple[list[Any], list[Any]]] = {
+        name: (
+            [getattr(network, quantity, None) for network in networks],
+            [getattr(network, quantity, None) for network in alone],
+        )
+        for quantity, name in _OF_NETWORKS.items()
+    }
+    rankings = [visit.critic_ranking for visit in visits]
+    if any(ranking is not None for ranking in rankings):
+        series[_RANKING] = [*[None] * initial, *rankings], []
+    figure.set_figwidth(2.8 * len(series))
+    panels = figure.subplots(1, len(series))
+    for axes, (name, (life, fresh)) in zip(panels, series.items(), strict=True):
+        _lines(axes, np.arange(len(life)) - initial, {"this life": life})
+        if name == _RANKING:
+            axes.axhline(0.5, color=GREY, linewidth=1.1)  # chance
+        elif None not in fresh:  # a stroke across each visit
+            x, label = np.arange(len(fresh)), "fresh agent of the phase"
+            axes.hlines(fresh, x - 0.45, x + 0.45, color="black", linewidth=1.6, label=label)
+        tick_visits(axes, cast(Any, visits), initial=initial)
         highest = max(number for number in (*life, *fresh) if number is not None)
         axes.set(ylabel=name, ylim=(0.0, max(0.05, 1.08 * highest)))
     legend_above(panels[0])
@@ -327,5 +297,5 @@ _FIGURES: dict[type[Diagnosis], dict[str, Callable[[Any, Figure], None]]] = {
         "what_the_critic_knows": _critic,
     },
     TeamDiagnosis: {"who_agents": _agents},
-    StreamDiagnosis: {"which_phases": _which_phases, "network_by_visit": _network_by_visit},
+    StreamDiagnosis: {"network_by_visit": _network_by_visit},
 }
