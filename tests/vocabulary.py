@@ -243,6 +243,7 @@ QUANTITIES = {
     "size": "bytes of an artefact",
     "place": "in a board's queue, from 1; 0 if it does not wait",
     "queue": "number of those that wait to be scored; 0 likewise",
+    "faults": "of the board's machine, which ended a scoring that was tried again",
     "episode": "number of an episode, from 1",
     "terminated": "1 if an episode ended by D, else 0",
     # Seeds and versions
