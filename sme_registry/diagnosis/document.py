@@ -128,6 +128,7 @@ class Diagnosis(DigestedFile):
     """What is known about the regret of a run; of a task, a team or a stream, with more fields.
 
     Attributes:
+      schema_version: version of the document's format.
       name: of the run or policy.
       task: what the file of the task or stream calls it.
       plan: algorithm, seed, steps and so on; empty without a run.

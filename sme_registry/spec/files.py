@@ -226,10 +226,12 @@ def _check_is_file(kind: type[Envelope], data: dict[str, Any], source: str, reme
             f"{data[f'{kind.content}_digest']!r:.90}. Give the file or the name of the "
             f"{word_of(kind)} itself."
         )
-    if "digest" not in data and (is_bare or kind.content in data):
+    drawn = {"digest", "fingerprint", "fingerprints"} & kind.model_fields.keys()
+    if (is_bare or kind.content in data) and (missing := drawn - data.keys()):
+        name = min(missing)
         raise MalformedDocumentError(
-            f"{source}: {'is a bare ' + kind.content + ': ' if is_bare else ''}digest: missing: "
-            f"must be the digest of the {kind.content}. To add it, {remedy}."
+            f"{source}: {'is a bare ' + kind.content + ': ' if is_bare else ''}{name}: missing: "
+            f"must be the {name} of the {kind.content}. To add it, {remedy}."
         )
     others = [other for other in Envelope.__subclasses__() if other.content in data]
     if others and kind.content not in data:

@@ -131,6 +131,13 @@ def test_other_numbers_than_the_published_neither_load_nor_run(saved):
             run()
 
 
+def test_a_file_without_a_fingerprint_says_how_to_write_one(saved):
+    data = json.loads(saved.read_text())
+    del data["fingerprint"]
+    with pytest.raises(SpecError, match=r"fingerprint: missing: .*sme_registry\.save\(spec, path"):
+        EnvFile.from_dict(data)
+
+
 def test_the_versions_of_the_fingerprints_are_those_of_the_constraints():
     pinned = (Path(__file__).parents[2] / "constraints.txt").read_text().splitlines()
     assert [*_TESTED.split(" and ")] == [
