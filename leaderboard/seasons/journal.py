@@ -278,9 +278,9 @@ class Play:
         self.last = snapshot["body"].tobytes(), snapshot["answer"].tobytes()
 
 
-def no_steps(budget: int, lanes: int = 1) -> Stepping:
-    """The regret of an instance that took no steps; `lanes` is 1 before the start."""
-    curve = (1.0,) * min(MOST_PARTS, budget // lanes)
+def no_steps(budget: int) -> Stepping:
+    """The regret of an instance that has not begun."""
+    curve = (1.0,) * min(MOST_PARTS, budget)
     return Stepping(steps=0, normalised_online_regret=1.0, learning_curve=curve)
 
 

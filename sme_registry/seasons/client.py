@@ -19,11 +19,9 @@ from gymnasium.vector.utils import batch_space
 from sme_registry.envs import arguments
 from sme_registry.errors import (
     EpisodeError,
-    MalformedDocumentError,
     OptionError,
     PolicyError,
     SealedError,
-    SpecError,
 )
 from sme_registry.evaluation import Policy
 from sme_registry.evaluation.policies import as_policy
@@ -228,11 +226,7 @@ class Instance:
     def status(self) -> TicketStatus:
         path = ticket_path(self._ticket.season, self._ticket.ticket)
         data = self._connection.request("GET", path, most=2**22)
-        try:
-            return TicketStatus.from_dict(parse_json(data, "answer"))
-        except (MalformedDocumentError, SpecError) as error:
-            message = f"the server's answer is invalid: {error} Check its version."
-            raise SealedError("wire", message) from None
+        return TicketStatus.from_dict(parse_json(data, "answer"), "answer")
 
     def __enter__(self) -> Instance:
         return self
