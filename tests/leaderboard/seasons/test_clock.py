@@ -33,7 +33,7 @@ def board(tmp_path, monkeypatch):
 @contextlib.contextmanager
 def served(board):
     """A server and a scorer, by threads of this process, whose clocks are set."""
-    work = Work(False, ScoreTicket((board.secret,)), SeasonStore)
+    work = Work(submissions=False, job=ScoreTicket((board.secret,)), board=SeasonStore)
 
     def score(stop):
         run_scorer(board.path, work=work, until_empty=False, stop=stop.is_set)

@@ -388,7 +388,7 @@ def test_tickets_that_cannot_be_scored_are_tried_again_after_others(played, monk
     broken.write_bytes(b"no journal")
     played.restart()
     set_clocks(monkeypatch, 0, passed=25)
-    work = Work(False, ScoreTicket((played.board.secret,)), SeasonStore)
+    work = Work(submissions=False, job=ScoreTicket((played.board.secret,)), board=SeasonStore)
 
     def attend():
         played.sessions.attend()
