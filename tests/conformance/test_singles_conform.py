@@ -34,11 +34,6 @@ KINDS = ["Default", "StateDim64", "HardFragile", "HardSafeMixed"]
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_an_entry_of_each_kind_passes_the_conformance_kit(name):
-    testing.check_env(f"SME/{name}-v1")
-
-
-@pytest.mark.parametrize("name", KINDS)
 def test_ids_pass_the_checkers_of_gymnasium_and_sb3(name):
     # With the id, and so the EnvSpec: check_env then also makes and tries each render mode.
     check_env(gymnasium.make(f"SME/{name}-v1").unwrapped, skip_render_check=name != "Default")
@@ -59,9 +54,15 @@ def test_every_catalogue_entry_has_an_id_by_name_and_one_by_content():
             assert gymnasium.make(sent).unwrapped.sme_spec.digest == spec.digest
 
 
+# Ends early and late, pays late, and its lanes drift apart.
+HARD = {"horizon": 12, "k": 5, "r_min": 0.3, "D": 0.35, "complexity": 2, "seed": 4}
+
+
 @pytest.mark.parametrize(
-    "fields",
+    "task",
     [
+        *(f"SME/{name}-v1" for name in KINDS),
+        HARD,
         {"horizon": 1, "state_dim": 1, "action_dim": 1},
         {"k": 7, "D": 0.75, "r_min": 0.9, "horizon": 20, "complexity": 3},
         {"k": 50, "horizon": 12},
@@ -69,14 +70,10 @@ def test_every_catalogue_entry_has_an_id_by_name_and_one_by_content():
         {"seed": "0xabcdef0123456789", "policy_init": "unit_variance", "complexity": 2,
          "horizon": 10},
     ],
-    ids=lambda fields: ",".join(fields),
+    ids=str,
 )  # fmt: skip
-def test_specs_at_the_edges_pass_the_conformance_kit(fields):
-    testing.check_env(fields)
-
-
-# Ends early and late, pays late, and its lanes drift apart.
-HARD = {"horizon": 12, "k": 5, "r_min": 0.3, "D": 0.35, "complexity": 2, "seed": 4}
+def test_entries_of_each_kind_and_specs_at_the_edges_pass_the_conformance_kit(task):
+    testing.check_env(task)
 
 
 def rollout(env, steps=30):
@@ -104,10 +101,6 @@ def test_make_vec_gives_the_same_numbers_in_every_mode(monkeypatch):
         )
         for got, wanted in zip(rollout(env), expected, strict=True):
             np.testing.assert_array_equal(got, wanted)
-
-
-def test_a_batch_of_a_hard_task_equals_its_singles_in_all_autoreset_modes():
-    testing.check_env(HARD, seed=1)
 
 
 @pytest.mark.parametrize("mode", [mode.value for mode in AutoresetMode])
@@ -168,23 +161,19 @@ UNEQUAL = {
 }
 
 
-@pytest.mark.parametrize("name", ["Team2", "TeamBlindShared4", "DuoDeep", "HardFragile"])
-def test_a_team_of_each_kind_passes_the_conformance_kit(name):
-    testing.check_team(name)
-
-
 @pytest.mark.parametrize(
-    "fields",
+    "task",
     [
+        *("Team2", "TeamBlindShared4", "DuoDeep", "HardFragile"),
         {"horizon": 1, "action_dim": 2, "team": {"agents": [{"action_dim": 1}] * 2}},
         {"k": 3, "r_min": 0.2, "D": 0.3, "horizon": 10, "team": UNEQUAL},
         {"k": 50, "horizon": 12, "D": 0.4, "team": {**UNEQUAL, "reward": "team"}},
         {"team": {"agents": [{"name": "lone_7", "action_dim": 4, "observes": [1, 3]}]}},
     ],
-    ids=["short", "fragile", "shared", "lone"],
+    ids=str,
 )
-def test_teams_at_the_edges_pass_the_conformance_kit(fields):
-    testing.check_team(fields)
+def test_teams_of_each_kind_and_at_the_edges_pass_the_conformance_kit(task):
+    testing.check_team(task)
 
 
 @pytest.mark.filterwarnings("ignore:Agents have different", "ignore:Observations are different")
