@@ -179,7 +179,7 @@ def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
         return
     with Progress("scoring", waiting, console=err(), unit="submissions") as progress:
         work = Work(isolation=isolation, board=Board)
-        run_scorers(board, workers, progress=progress.update_of, work=work)
+        run_scorers(board, workers, progress=progress.update, work=work)
     with Board.open(board) as store:
         entries = store.entries()
     counts = Counter(entry.status for entry in entries if entry.id not in before)
@@ -239,7 +239,7 @@ def site(
         total = len(store.entries())
         with Progress("writing", total, console=err(), unit="pages") as progress:
             index = server.write_site(
-                store, target, progress.update_of, explorers=explorers, sections=sections
+                store, target, progress.update, explorers=explorers, sections=sections
             )
     out().print(str(index.resolve()), soft_wrap=True, markup=False)
 

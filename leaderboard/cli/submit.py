@@ -228,7 +228,7 @@ def submit(
                     algorithm=algorithm,
                     receiver=receiver_of(board),
                     force=force,
-                    progress=progress.update_of,
+                    progress=progress.update,
                 )
         check_submission(document, bundle.signed.content, datetime.datetime.now(datetime.UTC))
         result = None if no_check else _scored(document, bundle, dry_run)
@@ -285,7 +285,7 @@ def _scored(document: BoardDocument, bundle: Bundle, required: bool) -> Result |
             document,
             submission,
             bundle.artefact,
-            progress=progress.update_of,
+            progress=progress.update,
             isolation=isolation_for_own(),
         )
 
@@ -299,7 +299,7 @@ def _send(board: str, bundle: Bundle, key: SigningKey | None) -> None:
     assert key is not None  # uploads are signed
     total = len(bundle.signed.content.runs)
     with Progress("uploading", total, console=err(), unit="artefacts") as progress:
-        client.submit(board, bundle.folder, key, progress=progress.update_of)
+        client.submit(board, bundle.folder, key, progress=progress.update)
 
 
 def _print_outcome(board: str, id: str, result: Result | None, sent: bool, json: bool) -> None:

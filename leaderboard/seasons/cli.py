@@ -104,7 +104,7 @@ def new(
     count = len(list(fields.hidden)) if fields.track == "sealed-offline" else 0
     with Progress("generating", count, console=err(), unit="instances") as progress:
         try:
-            season = create_season(fields, master, folder, progress.update_of)
+            season = create_season(fields, master, folder, progress.update)
         except BaseException:
             path.unlink(missing_ok=True)
             raise
@@ -132,7 +132,7 @@ def publish(
 
     season = read_season(folder)
     with Progress("checking", len(season.published), console=err(), unit="instances") as progress:
-        check_published(season, folder, progress.update_of)
+        check_published(season, folder, progress.update)
     with SeasonStore.open(board) as store:
         store.announce(season)
         if season.published:
@@ -209,7 +209,7 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
         store.reveal(Reveal(season=row.digest, master=master.raw.hex()))
         count = len(store.entrants(row.digest))
         with Progress("scoring", count, console=err(), unit="entries") as progress:
-            scored = score_entries(store, row.digest, progress.update_of)
+            scored = score_entries(store, row.digest, progress.update)
     out().print(f"{row.id}: revealed, {plural(scored, *_UNITS[row.kind])} scored.")
 
 

@@ -344,7 +344,7 @@ def enter(
             Progress("uploading", len(answers), console=err(), unit="answers") as progress,
             ServedBoard(board) as served,
         ):
-            served.send(path, signed, answers, read, signing_key, progress.update_of)
+            served.send(path, signed, answers, read, signing_key, progress.update)
     else:
         with SeasonStore.open(Path(board)) as store:
             enter_folder(store, signed, answers=answers.__getitem__)

@@ -124,7 +124,7 @@ def make(
             name=name,
             folder=out_folder,
             force=force,
-            progress=progress.update_of,
+            progress=progress.update,
         )
     _print(dataset, json)
     print_note(f"wrote {escape(str(dataset.path))}{os.sep}")

@@ -135,7 +135,7 @@ def evaluate(
             )
         policy = evaluation.as_policy(policies[0], document, **options)
         with _progress(resolved) as progress:
-            report = evaluation.evaluate(policy, document, resolved, progress=progress.update_of)
+            report = evaluation.evaluate(policy, document, resolved, progress=progress.update)
         if action_range is None and acts_below_range(policy, report):
             clipped = report.regions[0].clipped_share
             print_note(
@@ -189,7 +189,7 @@ def _on_stream(
             protocol,
             initial=initial,
             fresh=fresh,
-            progress=progress.update_of,
+            progress=progress.update,
             **options,
         )
     report = report.with_reference_regret(evaluation.reference_regret(stream))

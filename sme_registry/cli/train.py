@@ -283,19 +283,16 @@ def _train_on_data(options: Settings, data: str) -> None:
     algorithm, _ = check_algorithm(options.algorithm or "iql")
     steps = DEFAULT_STEPS if options.steps is None else options.steps
     arguments: dict[str, Any] = {"algorithm": algorithm, "steps": steps, "seed": options.seed}
-    arguments |= {name: settings.pop(name) for name in ("batch_size",) if name in settings}
+    if "batch_size" in settings:
+        arguments["batch_size"] = settings.pop("batch_size")
+    arguments["hyperparameters"] = settings
     title = f"training {algorithm.upper()}"
     with Progress(title, max(1, steps), console=err()) as progress:
         if is_sealed(data):
             if options.out_folder is None:
                 raise OptionError("--out: is required with a sealed data set: the policy's .npz.")
             check_new(options.out_folder, force=options.force)
-            policy = train_sealed(
-                data,
-                **arguments,
-                hyperparameters=settings,
-                progress=lambda done, _: progress.update(done),
-            )
+            policy = train_sealed(data, **arguments, progress=progress.update)
             policy.save(options.out_folder)
             print_line(escape(str(options.out_folder)))
             return
@@ -305,12 +302,11 @@ def _train_on_data(options: Settings, data: str) -> None:
         result = train_offline(
             dataset,
             **arguments,
-            hyperparameters=settings,
             evaluations=min(20, max(1, steps)),
             protocol=options.protocol,
             folder=folder,
             force=options.force,
-            progress=lambda done, total, note: progress.update(done, note),
+            progress=progress.update,
         )
     print_training(result, folder, [_improvement(result.record)], json=options.json)
 

@@ -218,17 +218,13 @@ class Progress:
         else:
             self.message(f"{self._title}: {note}")
 
-    def update(self, done: int, note: str | None = None, *, total: int | None = None) -> None:
-        """Set how far the job is; cheap enough to call at every step."""
+    def update(self, done: int, total: int | None = None, note: str | None = None) -> None:
+        """Set how far the job is, as callbacks report it; cheap enough to call at every step."""
         self._done = done
         self._rate_from = self._rate_from or (done, time.monotonic())
         self._note = self._note if note is None else note
         self._total = self._total if total is None else total
         self._refresh()
-
-    def update_of(self, done: int, total: int) -> None:
-        """Set how far the job is and how long it is, as callbacks `(done, total)` report it."""
-        self.update(done, total=total)
 
     def start_part(self, name: str, note: str = "") -> None:
         """Show a part of the job that runs from now on, and what it does first."""

@@ -343,7 +343,7 @@ class _StudyRun:
 
     def _show_counts(self) -> None:
         failed = self._queue.failed
-        self._progress.update(self._queue.finished, f"{failed} failed" if failed else "")
+        self._progress.update(self._queue.finished, note=f"{failed} failed" if failed else "")
 
     def _name(self, job: Job) -> str:
         """What people call a job: `PPO on k-25, run 3`, or `…, and 9 more`."""

@@ -232,7 +232,7 @@ class RunLog(Watch):
         if finished:
             self._note = self._progress_note()
             self._learner.log(finished)
-        self._progress.update(self._sums.steps, self._note)
+        self._progress.update(self._sums.steps, note=self._note)
 
     def on_visit(self, visit: int) -> None:
         assert self._snapshots is not None  # a task has no visits

@@ -376,7 +376,7 @@ def _report(
     }
     report: EvaluationReport | StreamReport
     with Progress("evaluating", states, console=console, unit="states", enabled=progress) as bar:
-        options["progress"] = bar.update_of
+        options["progress"] = bar.update
         if record.stream is None:
             report = evaluate(model, record.spec, record.protocol, **options)
         else:

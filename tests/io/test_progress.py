@@ -15,14 +15,14 @@ from sme_registry.io.terminal import Progress, duration, duration_range, err
 def test_without_a_terminal_it_prints_lines_and_in_one_it_draws_a_bar():
     text, bar, silent = io.StringIO(), io.StringIO(), io.StringIO()
     with Progress("training", 10, console=Console(file=text, width=200)) as progress:
-        progress.update(4, "note")
-        progress.update(10, "note")
+        progress.update(4, note="note")
+        progress.update(10, note="note")
     (line,) = text.getvalue().splitlines()
     assert line.startswith("training: 10 of 10 steps")
     assert line.endswith("done · note")
     console = Console(file=bar, force_terminal=True, width=160)
     with Progress("training", 10, console=console) as progress:
-        progress.update(10, "mean regret 0.5")
+        progress.update(10, note="mean regret 0.5")
     assert "mean regret 0.5" in bar.getvalue()
     assert "10 of 10 steps" in bar.getvalue()
     with Progress("training", 10, console=Console(file=silent), enabled=False) as progress:
@@ -55,11 +55,11 @@ def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(cl
         progress.prepare("compiling …")
         assert text.getvalue() == "training: compiling …\n"
         clock.now = 30.0
-        progress.update(20, "")
+        progress.update(20, note="")
         clock.now = 100.0
-        progress.update(90, "")
+        progress.update(90, note="")
         clock.now = 220.0
-        progress.update(95, "")
+        progress.update(95, note="")
     lines = text.getvalue().splitlines()[1:]
     assert lines == [
         "training: 20 of 100 steps",
