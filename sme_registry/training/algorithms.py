@@ -69,7 +69,7 @@ class Backend:
     Functions and classes are `module:name`, and imported when they are needed.
     """
 
-    settings: str  # from a learner's name, and what errors call it, to its hyperparameters' model
+    settings: str  # from a learner's name to its hyperparameters' model
     learns: tuple[Kind, ...]
     learner: str = ""  # its `Learner`; empty for what a study runs in another way
     names: tuple[str, ...] = ()  # its learners; empty where each name is one

@@ -125,7 +125,7 @@ class ConstantSettings(StrictModel):
     level: float = 0.0
 
 
-def constant_settings(name, field):
+def constant_settings(name):
     """What a row of the table names."""
     return ConstantSettings
 
