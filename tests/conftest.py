@@ -33,13 +33,15 @@ os.environ.setdefault(
 # JAX keeps only what took a second to compile; here the workers share all of it.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
-# First the files that compile most in JAX, as a worker is small then; then those that take longest,
-# so that no worker is left with one at the end.
+# First the files that take most memory for a moment, as a worker is small then; then those that
+# take longest, so that no worker is left with one at the end.
 FIRST = (
     "tests/studies/engine/test_lanes.py",
     "tests/studies/engine/test_lives.py",
     "tests/training/test_jax_runs.py",
     "tests/jax/",
+    "tests/evaluation/test_observation.py",
+    "tests/studies/engine/test_cell.py",
     "tests/test_documentation.py",
     "tests/docs/test_site.py",
     "tests/test_cli.py",
@@ -48,6 +50,7 @@ FIRST = (
 )
 ROOT = Path(__file__).parent.parent
 LITTLE, MUCH = 30_000_000, 150_000_000  # bytes since programs were last forgotten
+LARGE = 1_450_000_000  # a worker that forgets programs after each test that took a little
 _kept = 0
 
 settings.register_profile(
@@ -106,7 +109,8 @@ def pytest_runtest_teardown(item, nextitem):
     global _kept
     jax = sys.modules.get("jax")
     is_last = nextitem is None or nextitem.path != item.path
-    if jax and _memory() - _kept > (LITTLE if is_last else MUCH):
+    memory = _memory()
+    if jax and memory - _kept > (LITTLE if is_last or memory > LARGE else MUCH):
         jax.clear_caches()
         gc.collect()
         if sys.platform == "linux":
