@@ -18,6 +18,8 @@ from tests.training.runs import TINY, copy_files, short, without_figures
 
 pytest.importorskip("stable_baselines3")
 
+from sme_registry.training.models import random_seed
+
 _SCRIPT = """
 import sys
 from sme_registry import SMESpec
@@ -127,6 +129,10 @@ def test_a_run_that_was_killed_after_its_last_step_is_only_evaluated(killed, tmp
     assert result.model_path.exists()
     # On-policy algorithms finish their rollout: more steps are done than were asked for.
     before.updated(steps=20).continuing(before.updated(steps=20), tmp_path)
+
+
+def test_the_seeds_of_a_resumed_session_are_those_of_every_version():
+    assert [random_seed(3, 200), random_seed(0, 1)] == [319665505, 1982462498]
 
 
 @pytest.mark.parametrize(

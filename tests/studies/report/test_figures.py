@@ -84,6 +84,9 @@ def test_a_figure_of_levels_shows_those_of_its_own_metric(analysis):
         drawn = {float(y) for line in lines for y in line.get_ydata()}
         rows = levels[levels.metric == metric]
         assert {*rows.iqm} <= drawn <= {*rows.iqm, *rows.linear}
+        joined = [any(line.get_alpha() for line in axes.lines) for axes in picture.figure.axes]
+        assert joined[0]  # of k
+        assert not joined[-1]  # of classes that differ in several fields
 
 
 def test_levels_of_one_state_dimension_are_comparable(analysis):
