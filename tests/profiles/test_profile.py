@@ -30,6 +30,11 @@ AXIS = {axis.harder[0].rpartition("-")[0]: axis for axis in AXES}
 
 
 class TestPlan:
+    def test_a_quick_look_has_the_bases_and_the_hardest_level_of_each_axis(self):
+        bases = DEFAULT, TWO_LAYERS
+        hardest = (list(axis.levels)[-1] for axis in AXES)
+        assert run.quick_classes() == (*bases, *hardest)
+
     def test_its_levels_are_the_catalogues_tasks_in_five_draws(self):
         classes = {member.name: member for member in PLAN.plan.classes}
         assert set(classes) == {name for axis in AXES for name in axis.levels}
