@@ -42,6 +42,8 @@ FIRST = (
     "tests/jax/",
     "tests/evaluation/test_observation.py",
     "tests/studies/engine/test_cell.py",
+    "tests/task/test_certify.py",
+    "tests/task/test_draw.py",
     "tests/test_documentation.py",
     "tests/docs/test_site.py",
     "tests/test_cli.py",

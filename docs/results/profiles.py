@@ -7,9 +7,10 @@
 Agents are in JAX. The same command continues from the results in the folder (`--folder`, by default
 runs/profiles, which is not in the repository), also after a kill; programs that run save their
 state every three minutes. After `--minutes`, and after Ctrl-C, what has finished is written, so a
-part is kept by committing `sme_registry/profiles/references/`. TD3 and SAC with γ = 0 run on the
-default, the reward interval and foresight alone. A profile that the package lacks is shown nowhere.
-The pages follow with `python docs/generate.py` and `python docs/figures.py profiles`.
+part is kept by committing it: a whole profile is in `sme_registry/profiles/references/`, a part of
+one in `unfinished-profiles/` beside this script, and a class of which a file has every run is not
+run again. TD3 and SAC with γ = 0 run on the default, the reward interval and foresight alone. The
+pages follow with `python docs/generate.py` and `python docs/figures.py profiles`.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ import argparse
 import signal
 from pathlib import Path
 
-from sme_registry.errors import OptionError
+from sme_registry import Profile
 from sme_registry.profiles.document import REFERENCES
 from sme_registry.profiles.levels import AXES, TWO_LAYERS, plan_file
-from sme_registry.profiles.run import profile_of, slug
+from sme_registry.profiles.run import part_of_profile, slug
 from sme_registry.studies import run_study
 
+PARTS = Path(__file__).parent / "unfinished-profiles"
 SHORT = ("TD3 (gamma 0)", "SAC (gamma 0)")
 SHORT_AXES = ("k-5", "shaping-scale-10")  # a level of each
 
@@ -34,6 +36,20 @@ def classes_of(name: str) -> tuple[str, ...]:
         return tuple(member.name for member in plan_file().plan.classes)
     levels = [level for axis in AXES if {*axis.levels} & {*SHORT_AXES} for level in axis.levels]
     return tuple(dict.fromkeys(("default", TWO_LAYERS, *levels)))
+
+
+def joined(profiles: list[Profile]) -> Profile:
+    """The last one, with the rows of all that are of its plan and algorithm."""
+    last = profiles[-1]
+    same = [
+        p for p in profiles if (p.plan_digest, p.algorithm) == (last.plan_digest, last.algorithm)
+    ]
+    rows = {(row.class_name, row.run): row for profile in same for row in profile.rows}
+    order = sorted(rows, key=lambda place: (last.classes.index(place[0]), place[1]))
+    versions = {name: version for profile in same for name, version in profile.versions.items()}
+    return last.model_copy(
+        update={"rows": tuple(rows[place] for place in order), "versions": versions}
+    )
 
 
 def main() -> None:
@@ -52,19 +68,26 @@ def main() -> None:
         signal.alarm(60 * options.minutes)
     stopped = False
     for name in options.names:
-        only = [f"algorithm={name}", *(f"class={each}" for each in classes_of(name))]
+        places = [folder / f"{slug(name)}.json" for folder in (options.out, PARTS)]
+        earlier = [Profile.read(place) for place in places if place.exists()]
+        earlier = [profile for profile in earlier if profile.plan_digest == file.digest]
+        whole = {c for p in earlier for c in p.classes if len(p.values(c)) == p.seeds}
+        missing = [f"class={each}" for each in classes_of(name) if each not in whole]
         try:
-            if not stopped:
+            if missing and not stopped:
+                only = [f"algorithm={name}", *missing]
                 run_study(file, options.folder, only=only, jobs=options.jobs)
         except KeyboardInterrupt as interrupt:
             print(interrupt)
             stopped = True
-        try:
-            profile = profile_of(options.folder, name, classes=classes_of(name))
-        except OptionError as error:
-            print(f"{name}: {error}")
+        if not Path(options.folder).exists():
             continue
-        path = profile.write(options.out / f"{slug(name)}.json")
+        new = part_of_profile(options.folder, name, classes=classes_of(name))
+        profile = joined([*earlier, new])
+        is_whole = len(profile.rows) == profile.planned
+        path = profile.write(places[0] if is_whole else places[1])
+        if is_whole:
+            places[1].unlink(missing_ok=True)
         print(f"{path}: {len(profile.rows)} of {profile.planned} runs")
 
 

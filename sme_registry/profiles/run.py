@@ -182,6 +182,24 @@ def profile_of(
     A run counts if it is on the task of a level, with its seed, and its protocol and steps are
     those of the other runs that count; its evaluations may be more or fewer.
     """
+    profile = part_of_profile(folder, algorithm, classes=classes)
+    if not profile.values(DEFAULT):
+        errors = [f"The first failure: {failure.error}" for failure in profile.failures]
+        raise OptionError(
+            f"folder={str(folder)!r}: has no finished run on the default, from which robustness is "
+            f"computed, with the profile's draws, {profile.steps:,} steps and its protocol. "
+            f"{errors[0] if errors else 'Run that class of the plan profile-v1, too.'}"
+        )
+    return profile
+
+
+def part_of_profile(
+    folder: str | os.PathLike[str],
+    algorithm: str | None = None,
+    *,
+    classes: Sequence[str] | None = None,
+) -> Profile:
+    """The same of whatever runs the folder has."""
     ledger, released = Ledger(folder), plan_file()
     plan = ledger.study_file().plan
     chosen = _chosen(plan, algorithm)
@@ -193,14 +211,6 @@ def profile_of(
     places = {key: each for each in wanted if (key := keys.get(_task(each.cell)))}
     results = ledger.results(places)
     failures = ledger.failures(key for key in places if key not in results)
-    rows = tuple(row_of(places[key], result) for key, result in results.items())
-    if not any(row.class_name == DEFAULT for row in rows):
-        errors = [f"The first failure: {failure.error}" for failure in failures.values()]
-        raise OptionError(
-            f"folder={str(folder)!r}: has no finished run on the default, from which robustness is "
-            f"computed, with the profile's draws, {file.plan.steps:,} steps and its protocol. "
-            f"{errors[0] if errors else 'Run that class of the plan profile-v1, too.'}"
-        )
     return Profile(
         algorithm=chosen,
         plan=released.versioned_name,
@@ -209,7 +219,7 @@ def profile_of(
         steps=file.plan.steps,
         seeds=file.plan.seeds,
         classes=names,
-        rows=rows,
+        rows=tuple(row_of(places[key], result) for key, result in results.items()),
         failures=tuple(
             ProfileFailure(
                 class_name=places[key].class_name, run=places[key].run, error=failure.error[:500]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sme_registry import load, materialize
+from sme_registry import Profile, load, materialize
 
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
 
@@ -36,6 +36,12 @@ def test_a_plan_without_cost_beats_the_safe_projection_but_not_where_its_price_i
         assert earned.mean() >= plans.projected(task, 0).mean() + gain - 1e-9
         if task.spec.compensated:
             assert earned.max() <= 40.0 + 1e-9
+
+
+def test_the_parts_of_a_reference_profile_are_joined_to_the_whole(script):
+    whole = Profile.references()["PPO"]
+    parts = [whole.model_copy(update={"rows": rows}) for rows in (whole.rows[40:], whole.rows[:50])]
+    assert set(script("profiles").joined(parts).rows) == set(whole.rows)
 
 
 def printed(script, page):
