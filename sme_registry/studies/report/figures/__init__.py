@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -275,7 +274,7 @@ def draw_maps(analysis: Analysis) -> Drawn:
     inside = analysis.tables["results"][analysis.tables["results"].region == "WD"]
     single = [name for name, info in analysis.classes.items() if info.setting["team"] == "none"]
     plane = inside[(inside.state_dim == 2) & inside.class_name.isin(single)]
-    kept = _kept_maps(analysis, plane[plane.key.isin(analysis.models)])
+    kept, problem = _kept_maps(analysis, plane[plane.key.isin(analysis.models)])
     if not kept:
         return
     scale = maps.colour_scale([grid for grid, _ in kept.values()])
@@ -298,23 +297,27 @@ def draw_maps(analysis: Analysis) -> Drawn:
         "Similarity over the plane, beyond the unit square",
         "r̃ of a trained policy at each state of the plane, halfway through the episode; the square "
         "is the unit square, where it was trained. For each algorithm the run with the median r̃ "
-        "within distribution, among those whose model was kept.",
+        f"within distribution, among those whose model was kept.{problem}",
         figure,
         is_map=True,
     )
 
 
-def _kept_maps(analysis: Analysis, runs: pd.DataFrame) -> dict[tuple[str, str], tuple[Any, float]]:
-    """(class, algorithm) → its median run's map and WD similarity, if its model can be loaded."""
-    kept = {}
+def _kept_maps(
+    analysis: Analysis, runs: pd.DataFrame
+) -> tuple[dict[tuple[str, str], tuple[Any, float]], str]:
+    """(class, algorithm) → its median run's map and WD similarity; and why the last is absent."""
+    kept, problem = {}, ""
     for place, group in by_place(runs).items():
         median = group.sort_values(["similarity", "run"]).iloc[(len(group) - 1) // 2]
         spec = analysis.cells[median.key].cell.spec
-        with contextlib.suppress(SMEError):
+        try:
             policy = as_policy(analysis.models[median.key], spec)
             _, grid = maps.similarity_on_grid(policy, spec, _EPSILON, _RESOLUTION, _TIME)
             kept[place] = grid, median.similarity
-    return kept
+        except SMEError as error:
+            problem = f" {error}"
+    return kept, problem
 
 
 TASK_FIGURES = (
