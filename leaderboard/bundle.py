@@ -167,7 +167,7 @@ def make_bundle(
     }
     fields = {
         **manifest_fields(
-            *(key.public, method, version, family, knowledge, submitter, code, statement)
+            key.public, method, version, family, knowledge, submitter, code, statement
         ),
         "suite": {"name": suite.versioned_name, "digest": suite.digest},
         "runs_started": of_class | (runs_started or {}),
@@ -348,8 +348,14 @@ def _trained(folder: Path, record: RunRecord | None) -> SubmittedRun:
         f"{_RANGES[record.action_range]}; num_envs={record.num_envs}"
     )
     return SubmittedRun(
-        *(str(folder), record.spec, record.seed, record.steps_done, folder / _MODEL),
-        *(record.versions, settings, record.wall_seconds),
+        source=str(folder),
+        spec=record.spec,
+        seed=record.seed,
+        steps=record.steps_done,
+        policy=folder / _MODEL,
+        versions=record.versions,
+        settings=settings,
+        seconds=record.wall_seconds,
     )
 
 
@@ -393,8 +399,14 @@ def _cell(study: Path, status: studies.CellStatus) -> SubmittedRun:
     changed = to_json(cell.hyperparameters) if cell.hyperparameters else "default hyperparameters"
     settings = f"{cell.uses}, {changed}; actions in {_RANGES[cell.action_range]}; num_envs=1"
     return SubmittedRun(
-        *(source, cell.spec, cell.seed, steps, policy),
-        *(result.versions, settings, result.timing.total),
+        source=source,
+        spec=cell.spec,
+        seed=cell.seed,
+        steps=steps,
+        policy=policy,
+        versions=result.versions,
+        settings=settings,
+        seconds=result.timing.total,
     )
 
 

@@ -356,8 +356,9 @@ class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # unty
             agents = getattr(env, "agents", ())
             self._agents, n = agents if len(agents) > 1 else (), max(1, len(agents))
             steps = int(self.model.num_timesteps) // n
-            spec = lambda: env.get_attr("sme_spec")[0]  # noqa: E731
-            self._sums = Episodes(env.num_envs // n, n, spec, steps=steps)
+            self._sums = Episodes(
+                env.num_envs // n, n, lambda: env.get_attr("sme_spec")[0], steps=steps
+            )
 
     def _on_step(self) -> bool:
         assert self._sums is not None
