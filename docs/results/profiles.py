@@ -83,6 +83,9 @@ def main() -> None:
         if not Path(options.folder).exists():
             continue
         new = part_of_profile(options.folder, name, classes=classes_of(name))
+        if not new.rows:
+            print(f"{name}: the folder has no finished run")
+            continue
         profile = joined([*earlier, new])
         is_whole = len(profile.rows) == profile.planned
         path = profile.write(places[0] if is_whole else places[1])
