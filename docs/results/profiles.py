@@ -39,14 +39,11 @@ def classes_of(name: str) -> tuple[str, ...]:
 
 
 def joined(profiles: list[Profile]) -> Profile:
-    """The last one, with the rows of all that are of its plan and algorithm."""
+    """The last one, with the rows of all, which are of one plan."""
     last = profiles[-1]
-    same = [
-        p for p in profiles if (p.plan_digest, p.algorithm) == (last.plan_digest, last.algorithm)
-    ]
-    rows = {(row.class_name, row.run): row for profile in same for row in profile.rows}
+    rows = {(row.class_name, row.run): row for profile in profiles for row in profile.rows}
     order = sorted(rows, key=lambda place: (last.classes.index(place[0]), place[1]))
-    versions = {name: version for profile in same for name, version in profile.versions.items()}
+    versions = {name: version for each in profiles for name, version in each.versions.items()}
     return last.model_copy(
         update={"rows": tuple(rows[place] for place in order), "versions": versions}
     )
