@@ -49,9 +49,7 @@ def untrained(algorithm: str, spec: SMESpec) -> Perceptron:
 def fit(job: tuple[str, str, int, SMESpec, int]) -> dict[str, object]:
     """One row."""
     class_name, algorithm, run, spec, states = job
-    probe = probe_capacity(
-        untrained(algorithm, spec), materialize(spec), states, seed=run, progress=lambda _: None
-    )
+    probe = probe_capacity(untrained(algorithm, spec), materialize(spec), states, seed=run)
     row = dict(zip(KEY, (class_name, algorithm, run), strict=True))
     return row | {
         "states": probe.states,

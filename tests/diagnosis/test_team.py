@@ -9,7 +9,7 @@ from sme_registry import SMESpec, evaluate, load
 from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, load_run
 from sme_registry.diagnosis.measure import LINEAR, POLICY
 from sme_registry.diagnosis.task import TEAM_QUESTIONS, TeamDiagnosis
-from sme_registry.errors import UnknownNameError
+from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies import run_study
@@ -209,6 +209,11 @@ def test_a_cell_of_a_study_of_teams_is_diagnosed(tmp_path):
         }
     )
     file = StudyFile(name="teams", digest=plan.digest, plan=plan)
+    run_study(file, tmp_path, executor="in-process")
+    learner = next(p.cell for p in plan.cells if p.cell.uses == "A2C").digest
+    with pytest.raises(OptionError, match=r"model was not kept.*new folder, with --keep-models"):
+        load_cell(tmp_path, learner)
+    (tmp_path / "cells" / f"{learner.removeprefix('sha256:')}.json").unlink()
     run_study(file, tmp_path, executor="in-process", keep_models=True)
     cells = [path.stem for path in (tmp_path / "cells").iterdir()]
     assert len(cells) == 2

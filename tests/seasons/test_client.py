@@ -113,6 +113,7 @@ def test_a_single_environment_passes_gymnasium_s_checks(server):
     wrapped.reset(seed=1)
     observation = wrapped.step(wrapped.action_space.sample())[0]
     assert np.array_equal(wrapped.reset(seed=3)[0], observation)  # the episode goes on
+    assert hidden.np_random.random() == np.random.default_rng(3).random()
 
 
 @pytest.mark.parametrize("fault", WAYS_TO_FAIL)

@@ -123,7 +123,13 @@ def false_season(store, terms):
 
 def test_a_season_is_generated_from_its_plan_and_its_master(season, published, tmp_path):
     check_published(season, published)
-    assert create_season(read_plan(plan()), MASTER, tmp_path / "again") == season
+    counts = []
+    again = create_season(
+        read_plan(plan()), MASTER, tmp_path / "again", lambda *each: counts.append(each)
+    )
+    assert again == season
+    assert counts == [(done, len(season.published)) for done in range(1, len(counts) + 1)]
+    assert len(counts) == len(season.published)
     assert season.versions["numpy"] == np.__version__
     assert {"sme_registry", "python", "scipy"} <= set(season.versions)
     other = create_season(read_plan(plan()), Master(bytes(32)), tmp_path / "other")
@@ -213,7 +219,10 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, l
         return evaluate_many(policies, *arguments)
 
     monkeypatch.setattr("leaderboard.seasons.scoring.evaluate_many", counted)
-    assert [score_entries(store, season.id) for _ in range(2)] == [4, 4]
+    counts = []
+    assert score_entries(store, season.id, lambda *each: counts.append(each)) == 4
+    assert score_entries(store, season.id) == 4
+    assert counts == [(1, 4), (2, 4), (3, 4), (4, 4)]
     rankings = season_rankings(store, season, "wd_regret")
     generic, fitted = rankings["generic"], rankings["family"]
     assert [row.entry.id for row in generic] == [near, last, failed]

@@ -79,13 +79,17 @@ def test_bytes_are_sent_even_if_the_board_has_them_and_lost_requests_are_repeate
 ):
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
     posted = 202, json.dumps({"id": signed.id}).encode()
+    counts = []
     for get, put, post in (
         ([definition(store)], [(200, b"{}")], [posted]),
         ([None, definition(store)], [None, (503, b"<html>"), (201, b"{}")], [None, posted]),
     ):
         answers = {"GET": iter(get), "PUT": iter(put), "POST": iter(post)}
         with scripted(lambda method, _, answers=answers: next(answers[method])) as (url, asked):
-            assert client.submit(url, folder, key) == signed.id
+            sent = client.submit(url, folder, key, progress=lambda *each: counts.append(each))
+            assert sent == signed.id
+        assert counts.pop() == (1, 1)
+        assert not counts
         methods = [line.split()[0] for line in asked]
         assert methods == ["GET"] * len(get) + ["PUT"] * len(put) + ["POST"] * len(post)
 

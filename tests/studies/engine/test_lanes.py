@@ -234,6 +234,27 @@ def test_a_lane_whose_weights_are_not_finite_fails_and_the_others_go_on(whole, s
     assert numbers(study).items() <= numbers(whole).items()
 
 
+def test_weights_that_break_in_the_very_last_update_are_seen(tmp_path, monkeypatch):
+    monkeypatch.setattr(programs, "SECONDS_BETWEEN_STATES", 0.0)
+
+    def interrupt_at_the_end(done):
+        if done == STEPS:  # before the update that follows the last step
+            raise KeyboardInterrupt
+
+    def break_a_moment(arrays):
+        for name in arrays:
+            if "action_net.bias" in name and "optimiser" in name:
+                arrays[name][1] = np.nan
+
+    with pytest.raises(KeyboardInterrupt):
+        ran(tmp_path, on_steps=interrupt_at_the_end)
+    (state,) = (tmp_path / "states").glob("*.npz")
+    change_state(state, break_a_moment)
+    assert ran(tmp_path).count("failed") == 1
+    (failure,) = Ledger(tmp_path).failures().values()
+    assert "its weights were not finite after step 96." in failure.error
+
+
 def test_a_retry_goes_on_from_the_state_if_an_evaluation_at_the_end_failed(
     whole, study, state, monkeypatch
 ):
