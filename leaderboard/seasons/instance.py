@@ -27,7 +27,6 @@ from leaderboard.errors import Rejection, TamperedError
 from leaderboard.seasons.journal import Journal, Play, no_steps
 from leaderboard.seasons.scoring import Answered
 from leaderboard.seasons.season import (
-    MAX_LANES,
     Answers,
     InstanceHead,
     SeasonClass,
@@ -40,7 +39,7 @@ from sme_registry import io
 from sme_registry.errors import ActionError, SMEError, WireError
 from sme_registry.io import read_regular
 from sme_registry.seasons.transcript import EVERY, Chain, answers_head, challenge_head
-from sme_registry.seasons.wire import InstanceStatus, table_bytes
+from sme_registry.seasons.wire import MAX_LANES, InstanceStatus, table_bytes
 from sme_registry.spec.document import Document
 
 if TYPE_CHECKING:
@@ -148,8 +147,11 @@ class Instance:
                 snapshot = self._snapshot()
                 known = 0 if snapshot is None else int(snapshot["requests"])
                 with storage():
-                    self._journal = Journal.open(self._journal_path, known)
+                    self._journal = self._open_journal(None if self._ticket.is_scored else known)
             return self._journal
+
+    def _open_journal(self, known: int | None = 0) -> Journal:
+        return Journal.open(self._journal_path, self._setting.action_dim, known)
 
     @property
     def answered(self) -> bool:
@@ -293,7 +295,7 @@ class Instance:
         digest = self._signature.digest if is_stated else None
         if not self._journal_path.exists():
             return no_steps(self.budget)
-        journal = Journal.open(self._journal_path)
+        journal = self._open_journal()
         play = self._new_play(journal.lanes)
         last = journal.requests
         if not self._is_old:

@@ -35,7 +35,6 @@ import numpy.typing as npt
 
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.seasons.season import (
-    MAX_LANES,
     SealedResult,
     Season,
     Stepping,
@@ -45,7 +44,7 @@ from sme_registry import io
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.io import open_regular
 from sme_registry.seasons.transcript import EVERY, Chain, next_head
-from sme_registry.seasons.wire import StepFormat, StepsAnswer, table_bytes
+from sme_registry.seasons.wire import MAX_LANES, StepFormat, StepsAnswer, table_bytes
 from sme_registry.spec import SMESpec
 
 _MAGIC = b"sme-journal/1\n\0\0"
@@ -78,15 +77,20 @@ class Journal:
         return cls(path, lanes, action_dim)
 
     @classmethod
-    def open(cls, path: Path, known: int = 0) -> Journal:
-        """The journal of a file, up to its last whole record; the first `known` are not read."""
+    def open(cls, path: Path, action_dim: int, known: int | None = 0) -> Journal:
+        """The journal of a file, up to its last whole record; the first `known` are not read.
+
+        With None, as many as a file that is final has.
+        """
         with open_regular(path) as stream:
             header = stream.read(_START)
             if len(header) < _START or header[_HEADER.size :] != _crc(header[: _HEADER.size]):
                 raise TamperedError(path.name, "is not a journal")
-            magic, lanes, action_dim = _HEADER.unpack_from(header)
+            magic, lanes, channels = _HEADER.unpack_from(header)
             if magic != _MAGIC:
                 raise TamperedError(path.name, "is not a journal of this version")
+            if not 1 <= lanes <= MAX_LANES or channels != action_dim:
+                raise TamperedError(path.name, "is of other lanes or action channels")
             journal = cls(path, lanes, action_dim)
             journal._count(stream, known)
         return journal
@@ -161,8 +165,11 @@ class Journal:
             os.ftruncate(handle, self._size)
             self._torn = False
 
-    def _count(self, stream: BinaryIO, known: int) -> None:
+    def _count(self, stream: BinaryIO, known: int | None) -> None:
         """Count the records, up to the last whole one."""
+        if known is None:  # but for the last, which may be the end
+            size = os.fstat(stream.fileno()).st_size - _START
+            known = max(0, size // self._record_size - 1)
         if known:
             stream.seek(_START + (known - 1) * self._record_size)
             if self._record(stream)[0] == known:

@@ -50,7 +50,13 @@ from leaderboard.errors import BoardError, Rejection
 from sme_registry.errors import ActionError, WireError
 from sme_registry.io import read_regular, sha256_of
 from sme_registry.seasons.transcript import Count, Head, TicketHeads
-from sme_registry.seasons.wire import MAX_INSTANCES, Hidden, HiddenClass, instances_of, unpack_table
+from sme_registry.seasons.wire import (
+    MAX_INSTANCES,
+    Hidden,
+    HiddenClass,
+    instances_of,
+    unpack_table,
+)
 from sme_registry.spec import EvaluationProtocol, Setting
 from sme_registry.spec.document import (
     Digest,
@@ -66,9 +72,6 @@ from sme_registry.spec.document import (
 LEAST_COMPLEXITY = 5
 MAX_OFFLINE_INSTANCES = 400
 """Of a sealed-offline season: an entry lists an answer of each, in at most 64 KiB."""
-
-MAX_LANES = 256
-"""Of an instance that the server steps: the most copies that one request advances."""
 
 PLANNED = "sha256:" + "0" * 64
 """The commitment of a season that is not generated yet."""

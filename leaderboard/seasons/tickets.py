@@ -29,7 +29,6 @@ from leaderboard.seasons.instance import Instance, SignedFile, storage, write_wh
 from leaderboard.seasons.journal import played_bytes
 from leaderboard.seasons.scoring import HiddenTask, score_runs, sealed_result
 from leaderboard.seasons.season import (
-    MAX_LANES,
     AllHeads,
     Master,
     Place,
@@ -41,7 +40,7 @@ from leaderboard.seasons.store import SealedRow, SeasonStore
 from leaderboard.store import Store
 from sme_registry import seasons
 from sme_registry.io import file_lock
-from sme_registry.seasons.wire import StepFormat, TicketStatus
+from sme_registry.seasons.wire import MAX_LANES, StepFormat, TicketStatus
 
 
 def deadline(season: Season, row: SealedRow) -> str:
@@ -61,7 +60,7 @@ class Ticket:
         place = Place(season.id, "", 0, str(row.number), self.request.content.nonce)
         self.token = master.secret("token", place).hex()
         self.deadline = deadline(season, row)
-        self._closed = row.result is not None
+        self.is_scored = self._closed = row.result is not None
         self.folder = store.ticket_folder(row.track, row.number)
         self.signed_end = SignedFile(self.folder / "end.json", Signed[AllHeads], self.request)
         self._hidden = tuple(season.hidden)

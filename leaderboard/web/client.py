@@ -333,6 +333,7 @@ class _Copy:
             raise self._refusal(f"what it sends as {digest} has another digest")
         write_file(self.folder.object(digest), data)
         self.files += 1
+        self.bytes += len(data)
 
     def fetch_files(self, files: Files, without_data: bool) -> None:
         """Get the files of a list."""
@@ -342,14 +343,15 @@ class _Copy:
             try:
                 listed = [(str(each["path"]), int(each["size"])) for each in answer["files"]]
                 following = answer["next"]
-            except (LookupError, TypeError, ValueError) as error:
+            except (LookupError, TypeError, ValueError, OverflowError) as error:
                 raise self._refusal(f"its list of files is invalid: {error}") from None
             for path, size in listed:
                 if not _NAME.fullmatch(path):
                     raise self._refusal(f"it lists a file of the unsafe name {path!r:.80}")
                 if not (without_data and path.startswith("published/")):
                     self._fetch_file(files, path, size)
-            start = following if isinstance(following, int) and following > start else None
+            goes_on = listed and isinstance(following, int) and following > start
+            start = following if goes_on else None
         files.check()
 
     def _fetch_file(self, files: Files, name: str, size: int) -> None:
@@ -363,9 +365,10 @@ class _Copy:
             with open(growing, "ab") as stream:
                 while (start := stream.tell()) < size:
                     data = self._read(f"{files.address}/{name}?start={start}", _CHUNK, name)
-                    if not 0 < len(data) <= size - start:
+                    if len(data) != min(size - start, _CHUNK):  # few answers for many bytes
                         raise self._refusal(f"{name}: has another size than its list says")
                     stream.write(data)
+                    self.bytes += len(data)
                 stream.flush()
                 os.fsync(stream.fileno())
             os.replace(growing, path)
@@ -374,15 +377,14 @@ class _Copy:
         self.files += 1
 
     def _json(self, address: str, what: str) -> Any:
-        self._progress(what)
-        answer = self._served.request("GET", address, most=_MOST_LOG)
-        self._spend(_MOST_LOG if answer is None else len(str(answer)))
-        return answer
+        data = self._read(address, _MOST_LOG, what)
+        with contextlib.suppress(MalformedDocumentError):
+            return parse_json(data, address)
+        return None
 
     def _read(self, address: str, most: int, what: str) -> bytes:
         self._progress(what)
         data = self._served.read("GET", address, most=most)
-        self.bytes += len(data)
         self._spend(len(data))
         return data
 

@@ -226,7 +226,11 @@ class Instance:
     def status(self) -> TicketStatus:
         path = ticket_path(self._ticket.season, self._ticket.ticket)
         data = self._connection.request("GET", path, most=2**22)
-        return TicketStatus.from_dict(parse_json(data, "answer"), "answer")
+        status = TicketStatus.from_dict(parse_json(data, "answer"), "answer")
+        count, expected = len(status.instances), sum(1 for _ in self._ticket.places)
+        if count != expected:
+            raise SealedError("wire", f"answer: has {count} instances: must have {expected}.")
+        return status
 
     def __enter__(self) -> Instance:
         return self

@@ -96,6 +96,9 @@ _Secret = Annotated[Hex, Field(repr=False)]
 MAX_INSTANCES = 1000
 """Of all classes: a ticket has a run on each."""
 
+MAX_LANES = 256
+"""Of an instance that the server steps: the most copies that one request advances."""
+
 
 class HiddenClass(StrictModel):
     """One kind of hidden task.
@@ -158,7 +161,7 @@ class Ticket(StrictModel):
     ticket: Count
     token: _Secret
     deadline: Annotated[str, Field(max_length=40)]
-    lanes: Annotated[Integer, Field(ge=1)]
+    lanes: Annotated[Integer, Field(ge=1, le=MAX_LANES)]
     classes: Annotated[TupleOf[TicketClass], Field(min_length=1, max_length=MAX_INSTANCES)]
     signer: Signer | None = None
     _path: Path | None = PrivateAttr(None)  # of its file
@@ -209,7 +212,7 @@ class Ticket(StrictModel):
 
 class InstanceStatus(StrictModel):
     phase: Literal["waiting", "stepping", "answering", "answered"]
-    lanes: Annotated[Integer, Field(ge=1)] | None  # null before `start`
+    lanes: Annotated[Integer, Field(ge=1, le=MAX_LANES)] | None  # null before `start`
     requests: Count  # number of the last steps that were taken
     used: Count  # steps of the budget that were taken, over all lanes
 

@@ -154,7 +154,7 @@ def check(board, entrant, requests):
     chain = Chain(request=ticket.id, ticket=number, instance=0)
     play = Play(hidden.spec, hidden.starts, chain, LANES, 10**9)
     expected.update(play.started[8:])
-    journal = Journal.open(folder / "0.journal")
+    journal = Journal.open(folder / "0.journal", 1)
     assert journal.requests == requests
     sent = actions_of(number, requests)
     for count, (actions, body) in enumerate(zip(sent, journal.bodies(), strict=True), start=1):

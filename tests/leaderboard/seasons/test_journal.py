@@ -41,9 +41,9 @@ def test_a_torn_record_is_cut_off_and_the_next_one_takes_its_place(tmp_path):
         path = tmp_path / str(extra)
         written(path, 3)
         os.truncate(path, HEADER + 2 * RECORD + extra)
-        journal = Journal.open(path)
+        journal = Journal.open(path, A)
         journal.append(actions(9))
-        assert contents(Journal.open(path)) == [actions(1), actions(2), actions(9)]
+        assert contents(Journal.open(path, A)) == [actions(1), actions(2), actions(9)]
 
 
 def lose_a_page(data):
@@ -60,21 +60,21 @@ def test_a_journal_ends_before_a_record_that_is_not_whole_or_out_of_order(tmp_pa
     path = tmp_path / "0"
     written(path, 3)
     path.write_bytes(fault(path.read_bytes()))
-    journal = Journal.open(path)
+    journal = Journal.open(path, A)
     assert contents(journal) == [actions(1)]
     journal.append(actions(9))
-    assert contents(Journal.open(path)) == [actions(1), actions(9)]
+    assert contents(Journal.open(path, A)) == [actions(1), actions(9)]
     assert path.stat().st_size == HEADER + 2 * RECORD
 
 
 @pytest.mark.parametrize("known", [1, 2, 3, 4])
 def test_what_is_known_to_be_whole_is_not_read_again_unless_it_was_lost(tmp_path, known):
     written(tmp_path / "0", 3)
-    journal = Journal.open(tmp_path / "0", known)
+    journal = Journal.open(tmp_path / "0", A, known)
     assert contents(journal) == [actions(1), actions(2), actions(3)]
     journal.append(actions(4))
     assert list(journal.bodies(2, 3)) == [(3).to_bytes(8, "little") + actions(3)]
-    assert contents(Journal.open(tmp_path / "0")) == [actions(n) for n in range(1, 5)]
+    assert contents(Journal.open(tmp_path / "0", A)) == [actions(n) for n in range(1, 5)]
 
 
 @pytest.mark.parametrize("written_before", [0, 1, RECORD - 1])
@@ -102,11 +102,11 @@ def test_a_full_disk_adds_nothing(tmp_path, monkeypatch, written_before, is_undo
     for _ in range(2):
         with pytest.raises(OSError, match=r"No space|Input"):
             journal.append(actions(2))
-    assert journal.requests == Journal.open(path).requests == 1
+    assert journal.requests == Journal.open(path, A).requests == 1
     assert path.stat().st_size == HEADER + RECORD + (0 if is_undone else written_before)
     monkeypatch.undo()
     journal.append(actions(3))
-    assert contents(journal) == contents(Journal.open(path)) == [actions(1), actions(3)]
+    assert contents(journal) == contents(Journal.open(path, A)) == [actions(1), actions(3)]
 
 
 def test_what_was_added_is_flushed_to_the_disk_once_and_again_if_that_failed(tmp_path, monkeypatch):
@@ -143,11 +143,11 @@ def test_another_file_is_no_journal_and_a_journal_is_never_replaced(tmp_path):
     for content in (b"", b"x" * 20, b"x" * 100):
         path.write_bytes(content)
         with pytest.raises(TamperedError, match="is not a journal"):
-            Journal.open(path)
+            Journal.open(path, A)
     written(tmp_path / "1", 1)
     with pytest.raises(FileExistsError):
         Journal.create(tmp_path / "1", LANES, A)
-    assert Journal.open(tmp_path / "1").requests == 1
+    assert Journal.open(tmp_path / "1", A).requests == 1
 
 
 SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, seed=12)

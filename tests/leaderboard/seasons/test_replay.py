@@ -1,6 +1,8 @@
 """A revealed online season is replayed from its journals: what was altered is named."""
 
 import shutil
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -90,6 +92,17 @@ def test_altered_journals_and_answers_are_found(revealed, tmp_path):
         assert replayed(store)[1] == []
 
 
+@pytest.mark.parametrize(("lanes", "channels"), [(0, 1), (257, 1), (2**32 - 1,) * 2, (LANES, 2)])
+def test_a_journal_s_sizes_are_checked_before_they_are_used(revealed, tmp_path, lanes, channels):
+    shutil.copytree(revealed.path, tmp_path / "board")
+    with SeasonStore.open(tmp_path / "board", read_only=True) as store:
+        path = next(store.folder.seasons.rglob("*.journal"))
+        header = struct.pack("<16sII", b"sme-journal/1\n\0\0", lanes, channels)
+        path.write_bytes(header + zlib.crc32(header).to_bytes(4, "little"))
+        with pytest.raises(TamperedError, match="is of other lanes or action channels"):
+            replayed(store)
+
+
 def replace_answers(folder):
     (folder / "0.npy").write_bytes(wire.pack_table(np.full((ROWS, 1), 0.75)))
 
@@ -136,7 +149,7 @@ def test_what_the_entrant_has_not_signed_counts_for_nothing(tmp_path, monkeypatc
         before = scored(store, season, 1)
         assert [each.steps for each in before.stepping] == [0, LANES]
         for instance in (0, 1):
-            journal = Journal.open(played.folder / f"{instance}.journal")
+            journal = Journal.open(played.folder / f"{instance}.journal", 1)
             journal.ended = False  # as the organiser's own program may do
             for number in range(2, 12):
                 journal.append(request(number, 0.9)[8:])

@@ -1,5 +1,6 @@
 """The commands of online seasons, as an entrant types them: a ticket, then its answers."""
 
+import json
 import os
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from sme_registry.seasons import Instance, Ticket
 from tests.leaderboard.seasons.playing import online_board
 from tests.leaderboard.serving import serving
 from tests.leaderboard.test_cli import board_command, fails
+from tests.leaderboard.web.test_client import scripted
 
 
 @pytest.fixture
@@ -140,3 +142,21 @@ def test_refusals_have_stable_codes(url):
     plain = Ticket.read("ticket.json").to_dict() | {"token": "00" * 32}
     Ticket.from_dict(plain).write("other.json")
     assert "token_wrong" in command(1, "answer", url, "other.json", "constant", "-i", "deep-0")
+
+
+@pytest.mark.parametrize(
+    ("count", "lanes", "message"),
+    [(1, None, "has 1 instances: must have 2"), (2, 10**12, "lanes=1000000000000: must be")],
+)
+def test_a_status_that_is_not_the_ticket_s_is_refused(url, count, lanes, message):
+    start(0, url)
+    instance = {"phase": "waiting", "lanes": None, "requests": 0, "used": 0}
+    instances = [{**instance, "lanes": lanes}, instance][:count]
+    status = {"ticket": 1, "phase": "running", "deadline": "x", "instances": instances}
+    with scripted(lambda *_: (200, json.dumps(status).encode())) as (liar, asked):
+        held = json.loads(Path("ticket.json").read_text())
+        held["signer"]["address"] = liar
+        Path("ticket.json").write_text(json.dumps(held))
+        shown = command(1 if lanes is None else 2, "answer", liar, "ticket.json", "constant")
+    assert message in shown
+    assert len(asked) == 1

@@ -237,7 +237,7 @@ def test_a_ticket_ends_with_a_signature_of_all_its_transcripts(played):
 
 
 def test_asking_for_a_ticket_reads_no_journal_and_replays_nothing(played, monkeypatch):
-    """Whether it was put aside by a server that stopped, or by one that was killed."""
+    """Put aside by a server that stopped, or by one that was killed; or scored, with its end."""
     monkeypatch.setattr("leaderboard.seasons.instance.EVERY", 4)
     played.start()
     for number in range(1, 11):
@@ -257,6 +257,14 @@ def test_asking_for_a_ticket_reads_no_journal_and_replays_nothing(played, monkey
     monkeypatch.setattr(Play, "take", lambda *_: taken.append(1) or take(*_))
     played.step(11)
     assert len(taken) == 1
+    played.finish()
+    played.score()
+    for _ in range(2):
+        played.restart()
+        records.clear()
+        assert played.status().requests == 11
+        assert len(records) <= 3
+        os.truncate(played.folder / "0.journal", (played.folder / "0.journal").stat().st_size - 1)
 
 
 @pytest.mark.parametrize("fault", [b"", b"PK\x03\x04 no arrays", None])

@@ -88,9 +88,13 @@ def test_what_a_server_alters_is_refused_and_not_written(url, tmp_path, monkeypa
                 fetch(url, tmp_path / new.decode()[-3:].strip(":"))
 
 
-def test_a_limit_and_another_boards_folder_stop_it(url, tmp_path):
+def test_a_limit_and_another_boards_folder_stop_it(url, tmp_path, monkeypatch):
     with pytest.raises(BoardError, match=r"more than 10,000 bytes"):
         fetch(url, tmp_path / "copy", most=10_000)
+    with monkeypatch.context() as patch:
+        answering(patch, lambda path, data: data + b" " * 10**6 if "/log?" in path else data)
+        with pytest.raises(BoardError, match=r"more than 1,000,000 bytes"):
+            fetch(url, tmp_path / "copy", most=10**6)
     fetch(url, tmp_path / "copy")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("")
@@ -127,12 +131,17 @@ def test_seasons_are_copied_with_what_was_played_and_verified(seasons, tmp_path)
     assert len(verify(copy, board=SeasonStore).missing) == 6  # which the board itself lacks
 
 
+ENDLESS = b'{"files": [{"path": "a", "size": 1e999}], "next": null}'
+
+
 @pytest.mark.parametrize(
     ("answer", "match"),
     [
         (lambda path, data: b"" if "/files/" in path else data, "another size"),
         (lambda path, data: data + b"x" if "/files/" in path else data, "another size"),
+        (lambda path, data: data[:1] if "/files/" in path else data, "another size"),
         (lambda path, data: b"[]" if "/files?" in path else data, "list of files is invalid"),
+        (lambda path, data: ENDLESS if "/files?" in path else data, "list of files is invalid"),
         (lambda path, data: data.replace(b'"title"', b'"x"'), "definition is invalid"),
         (lambda path, data: data.replace(b'"draws": 10000', b'"draws": 999'), "another board"),
     ],
@@ -143,10 +152,20 @@ def test_a_server_that_contradicts_itself_is_refused(seasons, tmp_path, monkeypa
         fetch(seasons, tmp_path / "copy", board=SeasonStore, parts=[files_of_seasons])
 
 
-def test_a_list_of_files_that_never_ends_ends(seasons, tmp_path, monkeypatch):
-    again = b'{"files": [], "next": 0}'
-    answering(monkeypatch, lambda path, data: again if "/files?" in path else data)
+@pytest.mark.parametrize("following", [0, 10**9])
+def test_a_list_of_files_that_never_ends_ends(seasons, tmp_path, monkeypatch, following):
+    asked = []
+
+    def lie(path, data):
+        if "/files?" not in path:
+            return data
+        asked.append(path)
+        assert len(asked) < 9
+        return b'{"files": [], "next": %d}' % (following and following + len(asked))
+
+    answering(monkeypatch, lie)
     fetch(seasons, tmp_path / "copy", board=SeasonStore, parts=[files_of_seasons])
+    assert len(asked) == 2  # one of each season
 
 
 ODD = ("../up", "x" * 200, "/absolute", "tickets/../../up", ".stepping", "published/.a", "a//b")
