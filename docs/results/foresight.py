@@ -146,13 +146,8 @@ def foresight(runs: pd.DataFrame) -> pd.DataFrame:
 def noise(runs: pd.DataFrame) -> pd.DataFrame:
     """Mean and range of N₀ under noise, at one discount."""
     rows = runs[(runs["gamma"] == NOISY_GAMMA) & runs["class_name"].str.match(NOISY)]
-    return rows.pivot_table(
-        index="class_name",
-        columns="algorithm",
-        values="wd_regret",
-        aggfunc=["mean", "min", "max"],
-        sort=False,
-    )
+    levels = rows.groupby(["algorithm", "class_name"], sort=False)["wd_regret"]
+    return levels.agg(["mean", "min", "max"])
 
 
 def ranked(runs: pd.DataFrame, criticisms: pd.DataFrame, regions: Iterable[str]) -> pd.DataFrame:
@@ -163,17 +158,31 @@ def ranked(runs: pd.DataFrame, criticisms: pd.DataFrame, regions: Iterable[str])
 
 
 def associations(joined: pd.DataFrame) -> pd.DataFrame:
-    """Spearman's ρ with N₀: over all runs, and of ranks within (algorithm, class and discount)."""
+    """Spearman's ρ with N₀: over all runs, and of ranks within (algorithm, class and discount).
+
+    `p` is that of the latter, by permutation of N₀ within the cells.
+    """
     rows = {}
     for name, value in (("ranking", "ranking"), ("overestimation", "bias_share")):
         for algorithm, group in joined.dropna(subset=[value]).groupby("algorithm", sort=False):
-            within = group.groupby(["class_name", "gamma"])[[value, "wd_regret"]].rank()
+            cells = group.groupby(["class_name", "gamma"])
+            within = cells[[value, "wd_regret"]].rank()
             rows[name, algorithm] = {
                 "runs": len(group),
                 "over all": stats.spearmanr(group[value], group["wd_regret"]).statistic,
                 "within classes": within.corr().iloc[0, 1],
+                "p": chance(*within.to_numpy().T, cells.ngroup().to_numpy()),
             }
     return pd.DataFrame(rows).T.round(2)
+
+
+def chance(x: np.ndarray, y: np.ndarray, cells: np.ndarray, draws: int = 2_000) -> float:
+    """How often y, permuted within cells, correlates with x as much as it does."""
+    rng = np.random.default_rng(0)
+    order, correlation = np.argsort(cells, kind="stable"), abs(np.corrcoef(x, y)[0, 1])
+    x, y, cells = x[order], y[order], cells[order]
+    permuted = [y[np.lexsort((rng.random(len(y)), cells))] for _ in range(draws)]
+    return float(np.mean([abs(np.corrcoef(x, z)[0, 1]) >= correlation - 1e-9 for z in permuted]))
 
 
 def draw_grids(figure: Figure, runs: pd.DataFrame) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -58,7 +58,7 @@ def changes(runs: pd.DataFrame, value: str) -> pd.DataFrame:
 
 
 def association(runs: pd.DataFrame, value: str) -> pd.DataFrame:
-    """Spearman's ρ of sensitivity and a value, over runs and within classes (centred by class).
+    """Spearman's ρ of sensitivity and a value: of ranks within classes, and over runs.
 
     Runs that are worse than the constant ½ are left out: their actions hardly depend on anything.
     """
@@ -66,11 +66,12 @@ def association(runs: pd.DataFrame, value: str) -> pd.DataFrame:
     rows = {}
     for name, group in seen.groupby("algorithm"):
         pair = group[["wd_sensitivity", value]]
-        within = pair - pair.groupby(group["class_name"]).transform("mean")
+        ranks = pair.groupby(group["class_name"]).rank()
+        ranks -= ranks.groupby(group["class_name"]).transform("mean")  # classes may differ in size
         rows[name] = {
             "runs": len(pair),
+            "within classes": ranks.corr().iloc[0, 1],
             "over all": stats.spearmanr(*pair.to_numpy().T).statistic,
-            "within classes": stats.spearmanr(*within.to_numpy().T).statistic,
         }
     return pd.DataFrame(rows).T.round(2)
 
@@ -85,15 +86,30 @@ def draw_sensitivity(axes: Axes, runs: pd.DataFrame) -> None:
 
 
 def references(seeds: Iterable[int]) -> pd.DataFrame:
-    """Step reward and cost of the reference policies in the cube, means over instances."""
+    """Step reward, cost and violations of the reference policies in the cube: means of draws."""
     rows = [
-        {"policy": name, "step_reward": regions[0].step_reward, "wd_cost": regions[0].cost}
+        {
+            "policy": name,
+            "step_reward": regions[0].step_reward,
+            "wd_cost": regions[0].cost,
+            "violating_share": regions[0].violating_share,
+        }
         for seed in seeds
         for name, regions in evaluate(
             "constant", load("Safety20").derive(seed=seed), "paper-v1"
         ).safety.references.items()
     ]
     return pd.DataFrame(rows).groupby("policy").mean().round(3)
+
+
+def untrained(seeds: Iterable[int]) -> pd.DataFrame:
+    """N in the cube of the linear and of a random policy on the plain task: means of draws."""
+    rows = [
+        {name: evaluate(name, load("Default").derive(seed=seed), "quick-v1").wd_regret}
+        for seed in seeds
+        for name in ("linear", "random")
+    ]
+    return pd.DataFrame(rows).mean().to_frame().T.round(2)
 
 
 def draw_limits(axes: Axes, runs: pd.DataFrame, known: pd.DataFrame) -> None:
@@ -109,6 +125,49 @@ def draw_limits(axes: Axes, runs: pd.DataFrame, known: pd.DataFrame) -> None:
     legend_below(figure_of(axes), axes.get_legend_handles_labels()[0], most_across=3)
 
 
+def rows() -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """The runs on observations, those on limits, and what layers represent."""
+    runs, limits, layers = (
+        pd.read_csv(FOLDER / f"{name}.csv") for name in ("representation", "safety", "layers")
+    )
+    limits["step_reward"] = 1 - limits["price_of_safety"] - limits["wd_safe_regret"]
+    for table in (runs, limits):
+        table[GROWTH] = table["ood_regret"] - table["wd_regret"]
+    return runs, limits, layers
+
+
+def tables() -> Iterator[tuple[str, pd.DataFrame]]:
+    """Each table of the page, with its title."""
+    runs, limits, layers = rows()
+    for value in ("wd_regret", "ood_regret", GROWTH):
+        yield value, means(runs, value)
+        yield f"{value}: change from plain", changes(runs, value).round(2)
+    stuck = runs["wd_regret"] >= 1
+    yield "N of policies that do not train, plain", untrained((1, 2, 3))
+    yield "stuck", runs[stuck][["class_name", "algorithm", "run", "wd_regret"]]
+    outside = runs.assign(change=runs["distractor_regret"] - runs["wd_regret"])[~stuck]
+    outside = outside.dropna(subset=["change"])
+    yield "distractors outside: change of N", means(outside, "change").round(2)
+    yield "sensitivity", means(runs.dropna(subset=["wd_sensitivity"]), "wd_sensitivity")
+    for value in ("wd_regret", "ood_regret", GROWTH):
+        yield f"ρ of sensitivity and {value}", association(runs, value)
+    wide = layers.pivot(index=["class_name", "algorithm"], columns="layer")
+    wide = wide[["state_r2", "distractor_r2"]]
+    yield "R² by layer", wide.dropna().round(2)
+    yield "R² by layer, without distractors", wide[wide.isna().any(axis=1)].round(3)
+    earned = limits.groupby("algorithm", sort=False)[["step_reward", *VALUES, GROWTH, *SAFETY]]
+    yield "limits", earned.agg(["mean", "min", "max"]).round(3).stack(0, future_stack=True)
+    by_draw = limits.pivot(index="run", columns="algorithm").round(3)
+    yield "step reward by draw", by_draw["step_reward"]
+    yield "safe regret by draw", by_draw["wd_safe_regret"]
+    yield "references", references(limits["run"].unique())
+
+
+def printed() -> str:
+    """The tables of the page."""
+    return "\n\n".join(f"{title}\n{table.to_string()}" for title, table in tables())
+
+
 def main() -> None:
     """Print the tables and draw the figures, after compacting two reports if they are given."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -117,23 +176,9 @@ def main() -> None:
         compact(reports[0], OBSERVATION).to_csv(FOLDER / "representation.csv", index=False)
         compact(reports[1], SAFETY).to_csv(FOLDER / "safety.csv", index=False)
         shutil.copy(reports[0] / "tables" / "layers.csv", FOLDER / "layers.csv")
-    runs, limits, layers = (
-        pd.read_csv(FOLDER / f"{name}.csv") for name in ("representation", "safety", "layers")
-    )
-    limits["step_reward"] = 1 - limits["price_of_safety"] - limits["wd_safe_regret"]
-    for rows in (runs, limits):
-        rows[GROWTH] = rows["ood_regret"] - rows["wd_regret"]
+    print(printed())
+    runs, limits, _ = rows()
     known = references(limits["run"].unique())
-    for value in ("wd_regret", "ood_regret", GROWTH):
-        print(f"\n{value}\n{means(runs, value)}\nchange\n{changes(runs, value).to_string()}")
-    for value in OBSERVATION:
-        print(f"\n{value}\n{means(runs.dropna(subset=[value]), value)}")
-    for value in (GROWTH, "ood_regret", "wd_regret"):
-        print(f"\nsensitivity and {value}\n{association(runs, value)}")
-    wide = layers.pivot(index=["class_name", "algorithm"], columns="layer")
-    print("\nR² by layer\n", wide[["state_r2", "distractor_r2"]].round(3).to_string())
-    earned = limits.groupby("algorithm", sort=False)[["step_reward", *VALUES, GROWTH, *SAFETY]]
-    print("\nlimits\n", earned.agg(["mean", "min", "max"]).round(3).T.to_string(), "\n", known)
     with styled():
         seen, safe = new_figure((4.6, 3.2)), new_figure((4.6, 3.2))
         draw_sensitivity(seen.subplots(), runs.dropna(subset=["wd_sensitivity"]))

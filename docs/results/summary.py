@@ -10,6 +10,7 @@ The second form first writes `runs.csv`, one row a run, from the table that `sme
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,14 @@ RESULTS = Path(__file__).parent
 RUN = ["algorithm", "class_name", "run", "steps", "complexity", "spec_digest", "seed", "uses"]
 KEPT = ["online_regret", "linear_normalised_regret"]
 BY_REGION = ["normalised_regret", "similarity"]
+OF_LIVES = (
+    "visited_regret",
+    "forgetting",
+    "forward_transfer",
+    "learning_transfer",
+    "plasticity_ratio",
+)
+OF_TRAINING = "learning_transfer", "online_regret"
 MARGIN = 0.02  # of N₀, within which two implementations count as equal
 
 
@@ -163,21 +172,53 @@ def decay() -> Iterator[Any]:
 def agents() -> Iterator[Any]:
     """Whether the two implementations learn alike."""
     yield equality(rows("equal-agents", "runs.csv"))
+    yield references("Default")
 
 
 def continual() -> Iterator[Any]:
-    """Metrics of lives in the cube, and N at the end of each visit, of lives and fresh agents."""
+    """Metrics of lives in the cube, and by visit N at its end, of lives and fresh agents."""
     metrics = pd.read_csv(RESULTS / "continual" / "metrics.csv")
-    metrics = metrics[metrics["region"] == "WD"]
+    metrics = metrics[(metrics["region"] == "WD") & metrics["metric"].isin(OF_LIVES)]
     table = metrics.set_index(["class_name", "algorithm", "metric"])[["iqm", "low", "high"]]
     yield table.round(2)
     visits = pd.read_csv(RESULTS / "continual" / "visits.csv")
-    visits = visits[(visits["region"] == "WD") & (visits["metric"] == "normalised_regret")]
+    visits = visits[visits["region"] == "WD"].set_index("metric")
     place = ["class_name", "algorithm"]
-    yield visits.pivot_table(index=place, columns="visit", values="iqm", sort=False).round(2)
+    by_visit = {
+        metric: visits.loc[metric].pivot_table(
+            index=place, columns="visit", values="iqm", sort=False
+        )
+        for metric in ("normalised_regret", "plasticity_difference", *OF_TRAINING)
+    }
+    yield by_visit["normalised_regret"].round(2)
+    yield (by_visit["normalised_regret"] - by_visit["plasticity_difference"]).round(2)  # fresh
+    for metric in OF_TRAINING:
+        yield by_visit[metric].round(2)
+    tasks = [phase.spec for phase in load("Switch5").phases]
+    names = "linear", "random"
+    untrained = [[evaluate(name, task, "quick-v1").wd_regret for name in names] for task in tasks]
+    yield pd.DataFrame(untrained, columns=names).agg(["mean"]).round(2)
 
 
-PAGES = {page.__name__: page for page in (ablations, decay, agents, continual)}
+def offline() -> Iterator[Any]:
+    """r̃ of the data, of BC and of IQL, from the cells; and of policies that do not train."""
+    learners, untrained = {}, {}
+    for path in sorted((RESULTS / "offline-quality" / "cells").glob("*.json")):
+        cell = json.loads(path.read_text(encoding="utf-8"))
+        depth, result = cell["cell"]["spec"]["complexity"], cell["offline"]
+        data = result["behaviour_similarity"]
+        row = learners.setdefault((depth, result["nu"]), {"data": data})
+        row["data sd"] = result["behaviour_similarity_sd"]
+        name = cell["cell"]["uses"].removeprefix("offline:")
+        row[name], row[f"{name} sd"] = result["similarity"], result["similarity_sd"]
+        row[f"{name} - data"] = result["similarity"] - data
+        known = cell["report"]["references"]
+        untrained[depth] = {policy: of[0]["similarity"] for policy, of in known.items()}
+    yield pd.DataFrame(learners).T.sort_index().round(3)
+    yield pd.DataFrame(untrained).T.sort_index().round(3)
+
+
+PAGES = {page.__name__: page for page in (ablations, decay, agents, continual, offline)}
 
 
 def printed(page: str) -> str:

@@ -180,7 +180,8 @@ def report(
 ) -> None:
     """Report which property of the task breaks an algorithm, and how certain that is.
 
-    Of streams it reports what is forgotten, whether plasticity is lost, and what relatedness does.
+    Of streams it reports what is forgotten, how visits end beside fresh agents, and what
+    relatedness does.
 
     It writes a self-contained page index.html, its first figure, and a table as CSV and LaTeX; with
     --full every figure and number; by default to FOLDER/report. It uses the cells finished so far,

@@ -369,7 +369,7 @@ def plasticity_curve(
         _draw_level(axes, 1.0, "as a fresh agent", "-")
         tick_visits(axes, first[0].visits)
         axes.set_ylim(bottom=0.0)
-        axes.set_ylabel("plasticity ratio in WD\n(regret / fresh agent's, > 1: lost)")
+        axes.set_ylabel("plasticity ratio in WD\n(regret / fresh agent's, > 1: worse)")
     return figure_of(axes)
 
 

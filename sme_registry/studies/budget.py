@@ -177,7 +177,7 @@ def uneven_rollouts(plan: StudyPlan) -> list[str]:
             warnings.append(
                 f"{algorithm.name} on {', '.join(uneven)}: its rollouts of {n:,} steps do not end "
                 "where phases do. At the end of a visit it has learned from fewer steps than a "
-                "fresh agent, which counts as lost plasticity. Use "
+                "fresh agent, which raises its plasticity ratio. Use "
                 f"--set {algorithm.name}.n_steps={better}, and a batch_size that divides it."
             )
     return warnings

@@ -36,17 +36,17 @@ def verdict_of(policy, question):
 
 
 @functools.cache
-def safe_optimum():
+def safe_projection():
     return reference_policy("safe_projection", EXTENDED)
 
 
 def upper_bound_below(share):
     """The best safe action, or in this share of the states the upper bound in every channel."""
-    return lambda o: np.where(o[:, :1] < share, 1.0, safe_optimum()(o))
+    return lambda o: np.where(o[:, :1] < share, 1.0, safe_projection()(o))
 
 
 def third_channel(observation):
-    a = safe_optimum()(observation)
+    a = safe_projection()(observation)
     a[:, 2] = 1.0
     return a
 
@@ -70,7 +70,7 @@ def test_violations_are_judged_by_what_they_earn(policy, answer, reason):
         assert verdict.evidence["gain"] > 0.01
 
 
-def test_the_regret_of_the_safe_optimum_is_the_price_of_safety_and_a_constant_has_no_fault():
+def test_the_regret_of_the_safe_projection_is_the_price_of_safety_and_a_constant_has_no_fault():
     diagnosis = diagnosis_of("safe_projection", EXTENDED)
     assert answers(diagnosis) == ["no", "yes", "no", "no"]
     found = diagnosis.verdict("price_of_safety").evidence

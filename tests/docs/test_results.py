@@ -45,7 +45,13 @@ def test_the_parts_of_a_reference_profile_are_joined_to_the_whole(script):
 
 
 def printed(script, page):
-    return script("foresight").printed() if page == "foresight" else script("summary").printed(page)
+    own = page in ("foresight", "limits_and_distractors")
+    return script(page).printed() if own else script("summary").printed(page)
+
+
+def part(page, begin, end):
+    text = (RESULTS / f"{page}.md").read_text(encoding="utf-8")
+    return text[text.index(begin) : text.index(end)].replace("−", "-")
 
 
 @pytest.mark.parametrize(
@@ -57,15 +63,25 @@ def printed(script, page):
         ("foresight", "| misleading − control", "- **On the plain"),
         ("foresight", "## Noise", "## What is missing"),
         ("continual", "| | | N at visits", "![Plasticity"),
-        ("agents", "JAX minus SB3 in N₀", "A run of TD3"),
+        ("agents", "JAX minus SB3 in N₀", "Three runs of TD3"),
+        ("offline", "## Quality of the data", "## Ours and d3rlpy's"),
+        ("limits_and_distractors", "## Which distractors", "![Step reward against cost"),
     ],
 )
 def test_the_numbers_of_a_table_are_those_of_the_committed_rows(page, begin, end, script):
     pytest.importorskip("pandas")
-    text = (RESULTS / f"{page}.md").read_text(encoding="utf-8")
-    text = text[text.index(begin) : text.index(end)].replace("−", "-")
-    tables = "\n".join(re.findall(r"^\|.*", text, re.M))
+    tables = "\n".join(re.findall(r"^\|.*", part(page, begin, end), re.M))
     told = re.findall(r"-?\d+\.\d\d+", re.sub(r"= [\d., ]+", "", tables))
-    found = re.findall(r"-?\d+\.\d+", printed(script, page))
+    output = printed(script, page)
+    found = re.findall(r"-?\d+\.\d+", output)
     assert len(told) > 5
     assert {float(number) for number in told} <= {float(number) for number in found}
+    # A value and its interval, or its range, are neighbours in the output, too.
+    n = r"(-?\d+\.\d+)"
+    intervals = re.findall(rf"{n} [(\[]{n}(?:,| to) {n}[)\]]", tables)
+    neighbours = re.findall(rf"(?={n} +{n} +{n})", output)
+    assert as_numbers(intervals) <= as_numbers(neighbours)
+
+
+def as_numbers(rows):
+    return {tuple(map(float, row)) for row in rows}

@@ -72,8 +72,8 @@ _LIVES = {
         "forgets", "is better on earlier phases than ever before", "was not shown to forget",
     ),
     "plasticity_ratio": (
-        "loses plasticity", "learns more than a fresh agent",
-        "was not shown to lose plasticity",
+        "ends its visits worse than a fresh agent", "ends its visits better than a fresh agent",
+        "was shown to end its visits neither worse nor better than a fresh agent",
     ),
     "forward_transfer": (
         "is better on phases before their first visit than before training",
@@ -272,7 +272,7 @@ def _offline(analysis: Analysis) -> Found:
 
 
 def _lives(analysis: Analysis) -> Found:
-    """What each agent forgets in each stream, whether it loses plasticity, and what transfers."""
+    """What each agent forgets in each stream, how its visits end, and what transfers."""
     for name in analysis.streams:
         metrics = _rows(analysis.tables["stream_metrics"], class_name=name, region=WITHIN)
         for key, does in _LIVES.items():
@@ -345,10 +345,10 @@ def _caveats(analysis: Analysis, part: RunKind) -> Found:
     if few < ENOUGH_RUNS:
         yield finding(
             section, "few runs", "few",
-            f"Some numbers rest on {plural(few, 'run')}. The 95 % bootstrap interval of three runs "
-            "covers the truth in only 64–85 % of cases, depending on their distribution, of five "
-            f"in 80–95 %, of ten in 93–97 %. With fewer than {ENOUGH_RUNS}, this report calls a "
-            "result an indication at most.",
+            f"Some numbers rest on {plural(few, 'run')}. The 95 % bootstrap interval of a class "
+            "of three runs contains the truth in only 64–85 % of cases, depending on their "
+            "distribution, of five in 80–95 %, of ten in 93–97 %. With fewer than "
+            f"{ENOUGH_RUNS}, this report calls a result an indication at most.",
             runs=few,
         )  # fmt: skip
     if not part.streams:

@@ -364,7 +364,7 @@ def draw_plasticity(analysis: Analysis) -> Drawn:
         "stream-plasticity",
         "Plasticity by visit",
         "Normalised regret on the phase just visited, divided by that of a fresh agent after as "
-        f"many steps on that phase alone: above 1, plasticity was lost. {OVER_LIVES} In its first "
+        f"many steps on that phase alone: above 1, the life ends worse. {OVER_LIVES} In its first "
         "visit a life is a fresh agent itself: other values than 1 say nothing about plasticity.",
         figure,
     )
