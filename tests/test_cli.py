@@ -289,7 +289,7 @@ class TestShow:
 
     def test_a_stream_of_a_suite_is_shown_and_certified_by_its_digest(self):
         """It is in no file of its own."""
-        stream = catalogue.find(SuiteFile, "continual").suite.stream_instances[-1]
+        stream = catalogue.find(SuiteFile, "continual").suite.streams[-1].instances[-1]
         shown = json.loads(good("show", stream.digest[:19], "--json").stdout)
         assert shown == {"stream": stream.to_dict(), "digest": stream.digest}
         assert stream.digest in good("show", stream.digest[:19]).stdout

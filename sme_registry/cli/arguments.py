@@ -9,7 +9,7 @@ import os
 import typing
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import typer
 from rich.markup import escape
@@ -101,14 +101,22 @@ def find_file(kind: type[_File], name: str) -> _File:
     return kind.read(name) if is_path(name) else catalogue.find(kind, name)
 
 
-def find_any(name: str) -> Envelope | SMESpec | StreamSpec:
-    """The file of a name, path or digest; a spec or stream alone if it has no file of its own."""
+class Found(NamedTuple):
+    """A document, and its file; a spec or a stream may have none of its own."""
+
+    document: Any
+    file: Envelope | None
+
+
+def find_any(name: str) -> Found:
+    """The document of a name, path or digest."""
     if is_path(name):
-        return read_any(name)
+        file = read_any(name)
+        return Found(file.document, file)
     files = [file for kind in KINDS.values() for file in catalogue.entries(kind)]
     for file in files:
         if name in (file.name, file.versioned_name, file.digest):
-            return file
+            return Found(file.document, file)
     try:
         document = resolve(name).document
     except UnknownNameError as error:
@@ -119,7 +127,7 @@ def find_any(name: str) -> Envelope | SMESpec | StreamSpec:
             ) from None
         raise
     same = [file for file in files if file.digest == document.digest]
-    return same[0] if len(same) == 1 else document
+    return Found(document, same[0] if len(same) == 1 else None)
 
 
 def assignments(option: str, texts: Iterable[str] | None, example: str) -> dict[str, str]:

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from rich.markup import escape
 
 import sme_registry
-from sme_registry.cli.arguments import KINDS, Json, find_any, kind_of, print_tables
+from sme_registry.cli.arguments import KINDS, Found, Json, find_any, kind_of, print_tables
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import out, print_json, print_line, print_pairs
@@ -120,16 +120,15 @@ def _row(file: Envelope) -> dict[str, object]:
         stream = file.stream
         counts = {"phases": len(stream.phases), "cycles": stream.cycles, "steps": stream.steps}
     elif isinstance(file, SuiteFile):
-        suite = file.suite
-        counts = {"classes": len(suite.runs), "tasks": len(suite.instances)}
-        counts["streams"] = len(suite.stream_instances)
+        tasks, every = len(file.suite.instances), sum(file.suite.runs.values())
+        counts = {"classes": len(file.suite.members), "tasks": tasks, "streams": every - tasks}
     elif isinstance(file, ProtocolFile):
         protocol = file.protocol
         counts = {"regions": len(protocol.edges), "states each": protocol.states_per_region}
     elif isinstance(file, StudyFile):
         plan = file.plan
         counts = {
-            "classes": len(plan.classes) + len(plan.streams),
+            "classes": len(plan.members),
             "algorithms": ", ".join(algorithm.name for algorithm in plan.algorithms),
             "seeds": plan.seeds,
             "cells": number_of_cells(plan),
@@ -198,56 +197,56 @@ def show(
         return
     if name is None:
         raise OptionError("Give a name, a path or a digest, as in `sme show Default`.")
-    document = find_any(name)
+    found = find_any(name)
     if digests:
-        if json or not isinstance(document, SuiteFile):
+        if json or not isinstance(found.file, SuiteFile):
             raise OptionError("--digests: applies to suites, and not with --json. Leave one out.")
-        tasks = document.suite.documents
-        print_line("\n".join(each.digest for each in tasks))
+        print_line("\n".join(each.digest for each in found.document.documents.values()))
     elif json:
-        print_json(_data(document))
+        print_json(_data(found))
     else:
-        _show_document(name, document)
+        _show_document(name, found)
 
 
-def _show_document(name: str, document: Envelope | SMESpec | StreamSpec) -> None:
-    if isinstance(document, SMESpec | EnvFile):
-        _show_task(document)
-    elif isinstance(document, SuiteFile):
-        _show_suite(document)
-    elif isinstance(document, StudyFile):
-        out().print(catalogue_table([document]))
-        out().print(f"{document.digest}\nTo see its runs and times: sme study plan {escape(name)}")
-    elif isinstance(document, StreamSpec | StreamFile):
-        _show_stream(document)
-    elif isinstance(document, ProtocolFile):
-        fields = {**document.protocol.to_dict(), "digest": document.digest}
-        print_pairs(_title(document), fields)
+def _show_document(name: str, found: Found) -> None:
+    document, file = found
+    title = document.content_name if file is None else _title(file)
+    if isinstance(document, SMESpec):
+        _show_task(document, title)
+    elif isinstance(document, StreamSpec):
+        out().print(cards.stream_table(document, title))
+        out().print()
+        print_pairs("Stream", cards.stream_facts(document))
+    elif isinstance(file, SuiteFile):
+        _show_suite(file.suite, title)
+    elif isinstance(file, StudyFile):
+        out().print(catalogue_table([file]))
+        out().print(f"{file.digest}\nTo see its runs and times: sme study plan {escape(name)}")
+    else:
+        print_pairs(title, {**document.to_dict(), "digest": document.digest})
 
 
-def _data(document: Envelope | SMESpec | StreamSpec) -> dict[str, Any]:
+def _data(found: Found) -> dict[str, Any]:
     """A document as JSON, with what follows from it."""
-    if isinstance(document, StreamSpec):
+    document, file = found
+    if isinstance(document, SMESpec):
+        head = {} if file is None else summary(file)
+        agents = cards.agents(document)
+        derived = _facts(document) | ({"agents": agents} if agents else {})
+        head |= {"spec": document.to_dict(), "digest": document.digest, "derived": derived}
+        return head
+    if file is None:
         return {"stream": document.to_dict(), "digest": document.digest}
-    if isinstance(document, SuiteFile):
-        places = zip(document.suite.places, document.suite.documents, strict=True)
-        instances = [
-            {"class": name, kind: number, "digest": instance.digest}
-            for (name, kind, number), instance in places
-        ]
-        return {**document.to_dict(), "derived": {"instances": instances}}
-    if not isinstance(document, SMESpec | EnvFile):
-        return document.to_dict()
-    spec = document if isinstance(document, SMESpec) else document.spec
-    head = {} if isinstance(document, SMESpec) else summary(document)
-    agents = cards.agents(spec)
-    derived = _facts(spec) | ({"agents": agents} if agents else {})
-    return {**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": derived}
+    if not isinstance(file, SuiteFile):
+        return file.to_dict()
+    instances = [
+        {"class": name, kind: number, "digest": instance.digest}
+        for (name, kind, number), instance in file.suite.documents.items()
+    ]
+    return {**file.to_dict(), "derived": {"instances": instances}}
 
 
-def _show_task(document: SMESpec | EnvFile) -> None:
-    spec = document if isinstance(document, SMESpec) else document.spec
-    title = spec.content_name if isinstance(document, SMESpec) else _title(document)
+def _show_task(spec: SMESpec, title: str) -> None:
     print_pairs(title, cards.field_values(spec))
     if agents := cards.agents(spec):
         out().print()
@@ -317,40 +316,15 @@ def _spaces(spec: SMESpec) -> dict[str, str]:
     }
 
 
-def _show_stream(document: StreamSpec | StreamFile) -> None:
-    stream = document if isinstance(document, StreamSpec) else document.stream
-    title = stream.content_name if isinstance(document, StreamSpec) else _title(document)
-    out().print(cards.stream_table(stream, title))
-    out().print()
-    print_pairs("Stream", cards.stream_facts(stream))
-
-
-def _show_suite(file: SuiteFile) -> None:
-    suite = file.suite
-    tasks = [
-        {
-            "class": member.name,
-            "differs from the default in": cards.in_words(cards.changed_fields(member.setting)),
-            "seed": "\n".join(map(str, member.seeds)),
-            "task": _short_digests(member),
-        }
-        for member in suite.classes
+def _show_suite(suite: Suite, title: str) -> None:
+    tables = [
+        Table.of("", [_class_row(member) for member in members])
+        for members in (suite.classes, suite.streams)
+        if members
     ]
-    streams = [
-        {
-            "class": member.name,
-            "phases": len(member.stream.phases),
-            "cycles": member.stream.cycles,
-            "steps": member.stream.steps,
-            "draw": "\n".join(map(str, member.draws)),
-            "stream": _short_digests(member),
-        }
-        for member in suite.streams
-    ]
-    tables = [Table.of("", records) for records in (tasks, streams) if records]
-    tables[0].title, tables[-1].caption = _title(file), file.digest
+    tables[0].title, tables[-1].caption = title, suite.digest
     print_tables(tables)
-    digests = [each.digest for each in suite.documents]
+    digests = [each.digest for each in suite.documents.values()]
     kind = "task" if suite.classes else "stream"
     if known(SMESpec).keys() | known(StreamSpec).keys() >= set(digests):
         print_line(f"To train on a {kind}: sme train {digests[0][: cards.SHORT]}")
@@ -358,8 +332,18 @@ def _show_suite(file: SuiteFile) -> None:
         out().print(f"To train on these {kind}s: sme study new plan.json -a PPO --suite FILE")
 
 
-def _short_digests(member: SuiteClass | StreamClass) -> str:
-    return "\n".join(instance.digest[: cards.SHORT] for instance in member.instances)
+def _class_row(member: SuiteClass | StreamClass) -> dict[str, object]:
+    if isinstance(member, SuiteClass):
+        changed = cards.in_words(cards.changed_fields(member.setting))
+        about: dict[str, object] = {"differs from the default in": changed}
+        what = "task"
+    else:
+        stream = member.stream
+        about = {"phases": len(stream.phases), "cycles": stream.cycles, "steps": stream.steps}
+        what = "stream"
+    numbers = "\n".join(map(str, member.numbers))
+    digests = "\n".join(instance.digest[: cards.SHORT] for instance in member.instances)
+    return {"class": member.name, **about, member.kind: numbers, what: digests}
 
 
 def _title(file: Envelope) -> str:

@@ -41,11 +41,11 @@ from sme_registry.spec import (
     StreamSpec,
     StudyFile,
     Suite,
+    SuiteClass,
     SuiteFile,
     catalogue,
 )
 from sme_registry.spec.catalogue import is_path
-from sme_registry.spec.document import Document
 from sme_registry.spec.files import Envelope
 from sme_registry.spec.study import sweep
 from sme_registry.task import load
@@ -126,7 +126,7 @@ class ClassOptions:
         ),
     ] = 1
 
-    def members(self) -> dict[str, list[dict[str, Any]]]:
+    def members(self) -> dict[str, Any]:
         """The classes of a suite, one for each task or stream, or those of the sweeps."""
         instances = integer_in("instances", self.instances, 1, 10_000)
         documents = [load(task) for task in self.task or ()]
@@ -135,8 +135,8 @@ class ClassOptions:
             raise OptionError("--sweep: needs exactly one --task, and no --suite.")
         if self.suite is None and not documents:
             raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
-        classes: list[Document] = []
-        streams: list[Document] = []
+        classes: list[SuiteClass] = []
+        streams: list[StreamClass] = []
         if self.suite is not None:
             suite = find_file(SuiteFile, self.suite).suite
             classes, streams = [*suite.classes], [*suite.streams]
@@ -152,8 +152,7 @@ class ClassOptions:
             else:
                 draws = tuple(range(instances))
                 streams.append(StreamClass(name=name, stream=document, draws=draws))
-        kinds = {"classes": classes, "streams": streams}
-        return {name: [each.to_dict() for each in some] for name, some in kinds.items() if some}
+        return {"classes": classes, "streams": streams}
 
 
 def sweep_axes(texts: Iterable[str] | None) -> dict[str, list[Any]]:
@@ -327,33 +326,33 @@ def _check(name: str) -> tuple[dict[str, Any], list[tuple[str, SMESpec]]]:
     """Whether a document is valid, and the tasks in it. An unknown name is an error at once."""
     result: dict[str, Any] = {"name": name, "valid": False, "kind": None, "error": None}
     try:
-        document = find_any(name)
-        tasks = _tasks(name, document)
+        document, file = find_any(name)
+        tasks = _tasks(name, document, file)
     except SMEError as error:
         if not is_path(name):
             raise
         text = str(error)
         return result | {"error": text if name in text else f"{name}: {text}"}, []
-    if not isinstance(document, SMESpec | StreamSpec):
-        result["kind"] = kind_of(document)
+    if file is not None:
+        result["kind"] = kind_of(file)
     return result | {"valid": True, "digest": document.digest}, tasks
 
 
-def _tasks(name: str, document: Envelope | SMESpec | StreamSpec) -> list[tuple[str, SMESpec]]:
+def _tasks(name: str, document: Any, file: Envelope | None) -> list[tuple[str, SMESpec]]:
     """The tasks of a document; those of a file are drawn, and have its fingerprints."""
-    if isinstance(document, StudyFile):
-        _ = document.plan.cells
-    elif isinstance(document, SuiteFile):
-        suite = document.suite
-        labels = [f"{document.name}/{member} {kind} {n}" for member, kind, n in suite.places]
-        instances = zip(labels, suite.documents, strict=True)
-        return [task for label, instance in instances for task in _phases(label, instance)]
-    elif isinstance(document, EnvFile | StreamFile):
-        materialize_segments(*document.published)
-        return _phases(name, document.published.document)
-    elif isinstance(document, SMESpec | StreamSpec):
+    if isinstance(file, EnvFile | StreamFile):
+        materialize_segments(*file.published)
+    if isinstance(document, SMESpec | StreamSpec):
         return _phases(name, document)
-    return []
+    if isinstance(file, StudyFile):
+        _ = file.plan.cells
+    if not isinstance(file, SuiteFile):
+        return []
+    return [
+        task
+        for (member, kind, number), instance in file.suite.documents.items()
+        for task in _phases(f"{file.name}/{member} {kind} {number}", instance)
+    ]
 
 
 def _phases(label: str, document: SMESpec | StreamSpec) -> list[tuple[str, SMESpec]]:

@@ -351,8 +351,7 @@ def _train_suite(context: typer.Context, options: Settings, name: str) -> None:
     suite = file.suite
     if not suite.classes:
         only_with(context, ("steps",), "is that of each stream here. Leave it out")
-    first = suite.classes[0].instances[0] if suite.classes else suite.streams[0].stream
-    uses = options.uses(first)
+    uses = options.uses(suite.members[0].instances[0])
     folder = options.folder(file.name, uses)
     algorithm = {
         "name": algorithms.short_name(uses),
@@ -360,9 +359,9 @@ def _train_suite(context: typer.Context, options: Settings, name: str) -> None:
         "hyperparameters": settings,
         "action_range": options.action_range,
     }
-    members = {name: some for name, some in suite.to_dict().items() if some}
-    fields = {name: members[name] for name in ("classes", "streams") if name in members}
-    fields |= {
+    fields = {
+        "classes": suite.classes,
+        "streams": suite.streams,
         "algorithms": [algorithm],
         "seeds": equal_runs(suite) if options.seeds is None else options.seeds,
         "steps": DEFAULT_STEPS if options.steps is None else options.steps,

@@ -264,7 +264,7 @@ def known(kind: type[NamedDocument]) -> dict[str, Resolved[Any]]:
 
 @functools.cache
 def _instances() -> list[SMESpec | StreamSpec]:
-    return [document for file in entries(SuiteFile) for document in file.suite.documents]
+    return [each for file in entries(SuiteFile) for each in file.suite.documents.values()]
 
 
 def is_path(name: str) -> bool:

@@ -79,6 +79,11 @@ class Envelope(StrictModel):
     digest: Digest
 
     @property
+    def document(self) -> Any:
+        """What it holds: a spec, a stream, a suite, a plan or a protocol."""
+        return getattr(self, self.content)
+
+    @property
     def versioned_name(self) -> str:
         """`Default-v1`: the name in files and ids."""
         return f"{self.name}-v{self.version}"
@@ -91,7 +96,7 @@ class Envelope(StrictModel):
         if isinstance(data, dict) and data:
             _check_is_file(cls, data, name, remedy)
         envelope = super().from_dict(data, source)
-        expected = getattr(envelope, cls.content).digest
+        expected = envelope.document.digest
         if envelope.digest != expected:
             raise DigestMismatchError(
                 f"{name}: digest={envelope.digest!r}: its {cls.content} has {expected!r}. The "

@@ -28,12 +28,9 @@ from sme_registry.spec.document import (
 from sme_registry.spec.sme_spec import ActionRange, Setting, SMESpec
 from sme_registry.spec.stream import Phase, StreamSpec
 from sme_registry.spec.suite import (
-    Classes,
     EvaluationProtocol,
-    StreamClass,
-    StreamClasses,
+    Suite,
     SuiteClass,
-    check_classes,
 )
 
 FRESH_EVALUATIONS = 10  # at most, of a fresh agent
@@ -176,8 +173,8 @@ class PlannedCell(StrictModel):
         return self.phase is not None or self.cell.stream is not None
 
 
-class StudyPlan(Document):
-    """A study.
+class StudyPlan(Suite):
+    """A study: a suite, and what runs on it.
 
     Attributes:
       classes: kinds of tasks; the others are compared with the first.
@@ -201,11 +198,6 @@ class StudyPlan(Document):
       5
     """
 
-    fields_added_later: ClassVar[tuple[str, ...]] = ("streams",)
-
-    schema_version: SchemaVersion = 1
-    classes: Classes = ()
-    streams: StreamClasses = ()
     algorithms: Annotated[
         tuple[StudyAlgorithm, ...], Field(min_length=1, max_length=100, strict=False)
     ]
@@ -217,7 +209,6 @@ class StudyPlan(Document):
 
     @model_validator(mode="after")
     def _can_be_run(self) -> Self:
-        check_classes(self.classes, self.streams)
         check_names("algorithms", self.algorithms)
         for i, algorithm in enumerate(self.algorithms):
             if not self.classes and algorithm.steps is not None:
@@ -236,8 +227,7 @@ class StudyPlan(Document):
     @property
     def cells(self) -> tuple[PlannedCell, ...]:
         """Every run: seeds outermost, so that a study that is cut short has whole comparisons."""
-        members: list[SuiteClass | StreamClass] = [*self.classes, *self.streams]
-        instances_of = {member.name: member.instances for member in members}
+        instances_of = {member.name: member.instances for member in self.members}
         return tuple(
             planned
             for run in range(self.seeds)

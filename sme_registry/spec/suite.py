@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
@@ -30,28 +29,42 @@ from sme_registry.spec.sme_spec import Setting, SMESpec
 from sme_registry.spec.stream import StreamSpec
 
 
-def _check_distinct(field: str, values: Sequence[Any]) -> None:
-    if len(set(values)) != len(values):
-        raise ValueError(f"{field}={short_repr(list(values))}: must be distinct. Remove repeats.")
-
-
-class SuiteClass(Document):
-    """One kind of task: a setting of the axes and the seeds of its instances.
+class _Class(Document):
+    """A kind of task or stream, whose instances are told apart by a number.
 
     Attributes:
       name: of the class, unique in its suite.
+    """
+
+    kind: ClassVar[str]  # of the numbers, which are the field of that name and an s
+
+    name: Name
+
+    @property
+    def numbers(self) -> tuple[int | str, ...]:
+        """The seeds or draws, each once."""
+        return tuple(getattr(self, f"{self.kind}s"))
+
+    @model_validator(mode="after")
+    def _numbers_differ(self) -> Self:
+        if len(set(self.numbers)) != len(self.numbers):
+            given = short_repr(list(self.numbers))
+            raise ValueError(f"{self.kind}s={given}: must be distinct. Remove repeats.")
+        return self
+
+
+class SuiteClass(_Class):
+    """One kind of task: a setting of the axes and the seeds of its instances.
+
+    Attributes:
       setting: every field of its tasks except the seed.
       seeds: of its instances, each once.
     """
 
-    name: Name
+    kind = "seed"
+
     setting: Setting
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1, max_length=10_000, strict=False)]
-
-    @model_validator(mode="after")
-    def _seeds_differ(self) -> Self:
-        _check_distinct("seeds", self.seeds)
-        return self
 
     @property
     def instances(self) -> tuple[SMESpec, ...]:
@@ -60,35 +73,26 @@ class SuiteClass(Document):
         return tuple(SMESpec.from_dict({**fields, "seed": seed}) for seed in self.seeds)
 
 
-class StreamClass(Document):
+class StreamClass(_Class):
     """One kind of stream, and its instances.
 
     Attributes:
-      name: of the class.
       stream: the stream. A name, id, digest or path of one is read as what it stands for.
       draws: the numbers of its instances; see `StreamSpec.draw`.
     """
 
-    name: Name
+    kind = "draw"
+
     stream: Annotated[StreamSpec, BeforeValidator(partial(find_named, StreamSpec))]
     draws: Annotated[
         tuple[Annotated[Integer, Field(ge=0, lt=2**32)], ...],
         Field(min_length=1, max_length=10_000, strict=False),
     ] = (0,)
 
-    @model_validator(mode="after")
-    def _draws_differ(self) -> Self:
-        _check_distinct("draws", self.draws)
-        return self
-
     @property
     def instances(self) -> tuple[StreamSpec, ...]:
         """The streams of this class, in the order of its draws."""
         return tuple(self.stream.draw(number) for number in self.draws)
-
-
-Classes = Annotated[tuple[SuiteClass, ...], Field(max_length=1000, strict=False)]
-StreamClasses = Annotated[tuple[StreamClass, ...], Field(max_length=1000, strict=False)]
 
 
 class Suite(Document):
@@ -109,13 +113,24 @@ class Suite(Document):
     fields_added_later: ClassVar[tuple[str, ...]] = ("streams",)
 
     schema_version: SchemaVersion = 1
-    classes: Classes = ()
-    streams: StreamClasses = ()
+    classes: Annotated[tuple[SuiteClass, ...], Field(max_length=1000, strict=False)] = ()
+    streams: Annotated[tuple[StreamClass, ...], Field(max_length=1000, strict=False)] = ()
 
     @model_validator(mode="after")
     def _can_be_told_apart(self) -> Self:
-        check_classes(self.classes, self.streams)
+        if not self.members:
+            raise ValueError(
+                "classes: must have at least 1 entry, unless there are streams. Add a class, or a "
+                "stream."
+            )
+        check_names("classes", self.classes)
+        check_names("streams", self.members)
         return self
+
+    @property
+    def members(self) -> tuple[SuiteClass | StreamClass, ...]:
+        """The classes of tasks, and then those of streams."""
+        return (*self.classes, *self.streams)
 
     @property
     def instances(self) -> tuple[SMESpec, ...]:
@@ -123,27 +138,18 @@ class Suite(Document):
         return tuple(spec for member in self.classes for spec in member.instances)
 
     @property
-    def stream_instances(self) -> tuple[StreamSpec, ...]:
-        """Every stream of the suite, class by class."""
-        return tuple(stream for member in self.streams for stream in member.instances)
-
-    @property
-    def documents(self) -> tuple[SMESpec | StreamSpec, ...]:
-        """Every spec of the suite, and then every stream."""
-        return (*self.instances, *self.stream_instances)
-
-    @property
-    def places(self) -> list[tuple[str, str, int | str]]:
-        """Of each of the documents the class, "seed" or "draw", and which."""
-        seeds = [(member.name, "seed", seed) for member in self.classes for seed in member.seeds]
-        draws = [(member.name, "draw", draw) for member in self.streams for draw in member.draws]
-        return [*seeds, *draws]
+    def documents(self) -> dict[tuple[str, str, int | str], SMESpec | StreamSpec]:
+        """Every spec, and then every stream, by its class, "seed" or "draw", and which."""
+        documents: dict[tuple[str, str, int | str], SMESpec | StreamSpec] = {}
+        for member in self.members:
+            places = [(member.name, member.kind, number) for number in member.numbers]
+            documents.update(zip(places, member.instances, strict=True))
+        return documents
 
     @property
     def runs(self) -> dict[str, int]:
         """Class → number of its instances, of tasks and of streams."""
-        tasks = {member.name: len(member.seeds) for member in self.classes}
-        return tasks | {member.name: len(member.draws) for member in self.streams}
+        return {member.name: len(member.numbers) for member in self.members}
 
     def check_no_streams(self, what: str) -> None:
         """Raise SpecError if the suite has streams."""
@@ -153,16 +159,6 @@ class Suite(Document):
                 f"suite: has streams ({names}), and {what} needs single tasks. Choose a suite "
                 "without streams; studies run lives in streams: `sme study new --suite`."
             )
-
-
-def check_classes(classes: tuple[SuiteClass, ...], streams: tuple[StreamClass, ...]) -> None:
-    if not classes and not streams:
-        raise ValueError(
-            "classes: must have at least 1 entry, unless there are streams. Add a class, or a "
-            "stream."
-        )
-    check_names("classes", classes)
-    check_names("streams", (*classes, *streams))
 
 
 class EvaluationProtocol(Document):

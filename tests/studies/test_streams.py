@@ -53,12 +53,12 @@ def test_the_suite_of_the_catalogue_has_ten_draws_of_each_of_its_streams():
     assert not suite.classes
     assert {member.name: member.stream for member in suite.streams} == streams
     assert suite.runs == dict.fromkeys(streams, 10)
-    assert len({stream.digest for stream in suite.stream_instances}) == 60
+    assert len({stream.digest for stream in suite.documents.values()}) == 60
 
 
 def test_a_suite_has_a_class_for_a_stream_beside_tasks():
     suite = new_suite("-t", "Default")
-    assert suite.stream_instances == tuple(STREAM.draw(number) for number in range(3))
+    assert suite.streams[0].instances == tuple(STREAM.draw(number) for number in range(3))
     assert [member.name for member in suite.classes] == ["Default"]
     assert suite.runs == {"Default": 3, "mine": 3}
     wider = commands.good("new", "wider.json", "--suite", "lives.json", "-t", "Switch5")
@@ -75,12 +75,12 @@ def test_a_suite_of_streams_is_shown_with_names_to_train_by():
     assert "120,000" in shown
     assert "To train on a stream: sme train sha256:" in shown
     lines = good("show", "continual", "--digests").split()
-    instances = catalogue.find(SuiteFile, "continual").suite.stream_instances
+    instances = [*catalogue.find(SuiteFile, "continual").suite.documents.values()]
     assert lines == [stream.digest for stream in instances]
     assert load(lines[1], StreamSpec) == instances[1]
-    suite = new_suite("-t", "Default")
+    new_suite("-t", "Default")
     entries = json.loads(good("show", "lives.json", "--json"))["derived"]["instances"]
-    assert entries[-1] == {"class": "mine", "draw": 2, "digest": suite.stream_instances[2].digest}
+    assert entries[-1] == {"class": "mine", "draw": 2, "digest": STREAM.draw(2).digest}
     assert "To train on these tasks: sme study new" in good("show", "lives.json")
     listed = good("list", "--kind", "suite").splitlines()
     (line,) = (line for line in listed if line.startswith("continual"))
