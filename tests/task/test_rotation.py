@@ -70,17 +70,6 @@ def test_agents_rotate_within_the_channels_that_they_observe():
     )
 
 
-@pytest.mark.parametrize("complexity", [1, 10])
-def test_the_angle_says_how_far_apart_two_tasks_are(complexity):
-    spec = SMESpec(complexity=complexity)
-    s = np.random.default_rng(2).random((4_000, spec.state_dim))
-    other = materialize(spec).optimal_action(s)
-    for theta, low, high in ((0.1, 0.08, 0.13), (0.3, 0.25, 0.37), (math.pi, 1.8, 2.05)):
-        optimal = materialize(spec.derive(rotation=theta)).optimal_action(s)
-        regret = np.abs(optimal - other).mean() / np.abs(optimal - 0.5).mean()
-        assert low <= regret <= high
-
-
 @st.composite
 def safe_tasks(draw):
     fields = draw(spec_fields(team=False)) | {"D": 0.0, "safety": draw(SAFETY)}

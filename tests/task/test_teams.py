@@ -1,4 +1,4 @@
-"""Teams by the definition: who owns and sees what, what each is paid, and what moves with what."""
+"""Teams by the definition: who owns and sees what, what each is paid, and whose regret it is."""
 
 import numpy as np
 from hypothesis import given
@@ -105,3 +105,50 @@ def test_names_and_channels_are_in_the_order_of_the_spec():
     assert [len(policy) for policy in task.layers] == [2, 2, 2]
     assert [policy[0].W.shape[1] for policy in task.policies] == [2, 8, 3]
     assert [policy[-1].W.shape[0] for policy in task.policies] == [1, 2, 3]
+
+
+@given(specs(), st.integers(0, 9))
+def test_regret_shares_add_up_to_the_teams_regret_and_none_is_negative(spec, seed):
+    task = materialize(spec)
+    s, a = near_optimal(task, 50, seed)
+    kept = s.copy(), a.copy()
+    shares, gains = task.regret_shares(s, a), task.difference_rewards(s, a)
+    assert shares.shape == gains.shape == (50, len(task.names))
+    assert (shares >= 0.0).all()
+    np.testing.assert_allclose(shares.sum(axis=1), task.regret(s, a), rtol=0, atol=1e-12)
+    if len(task.names) == 1 and spec.r_min == 0.0:
+        np.testing.assert_allclose(gains[:, 0], task.regret(s, a), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(s, kept[0])
+    np.testing.assert_array_equal(a, kept[1])
+    np.testing.assert_allclose(task.regret_shares(s[0], a[0]), shares[0], rtol=0, atol=1e-11)
+    assert task.difference_rewards(s[0], a[0]).shape == gains[0].shape
+
+
+def test_shares_are_in_proportion_to_the_distance_of_each_agents_action():
+    task = materialize(TRIO)
+    s, _ = near_optimal(task, 1)
+    best = task.optimal_action(s)
+    away = np.where(best > 0.5, -0.1, 0.1)
+    shares = task.regret_shares(s, best + away)[0]
+    np.testing.assert_allclose(shares, 0.4 * np.array([1, 2, 3]) / 6, rtol=0, atol=1e-12)
+
+
+@given(specs(), st.integers(0, 9))
+def test_difference_rewards_are_those_of_brute_force(spec, seed):
+    task = materialize(spec)
+    s, a = near_optimal(task, 8, seed)
+    got = task.difference_rewards(s, a)
+    assert ((got >= 0.0) & (got <= 1.0)).all()
+    for lane in range(8):
+        first = 0
+        for agent, width in enumerate(own.stop - own.start for own in task.owned):
+            mended = a[lane].copy()
+            mended[first : first + width] = task.optimal_action(s[lane])[first : first + width]
+            first += width
+            gain = task.step_reward(s[lane], mended) - task.step_reward(s[lane], a[lane])
+            # BLAS may order the sums of one state and of a batch differently.
+            if abs(gain - got[lane, agent]) > 1e-9:
+                graded = 4.0 * (np.array([
+                    task.similarity(s[lane], mended), task.similarity(s[lane], a[lane])
+                ]) - 0.75)  # fmt: skip
+                assert np.abs(graded - spec.r_min).min() < 1e-9
