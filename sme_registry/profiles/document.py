@@ -23,11 +23,10 @@ from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
-from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.io.markup import Table, card, conjunction, fixed, signed, table_html
 from sme_registry.profiles.levels import AXES, DEFAULT, Axis, plan_file
 from sme_registry.spec import StudyAlgorithm
-from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
+from sme_registry.spec.document import Digest, Integer, Real, StoredModel, StrictModel, TupleOf
 from sme_registry.spec.study import PlannedCell
 from sme_registry.statistics import Array, Statistic, iqm
 from sme_registry.studies.report.analysis import ENOUGH_RUNS, Bootstrap
@@ -95,7 +94,7 @@ class DrawEstimate(NamedTuple):
         return text(self.value) + ends
 
 
-class Profile(StrictModel):
+class Profile(StoredModel):
     """Where an algorithm breaks: its regret on the default and on harder levels of nine axes.
 
     `print(profile)` shows a row for each axis, `profile.sentences()` compares it with the reference
@@ -132,15 +131,6 @@ class Profile(StrictModel):
     rows: TupleOf[ProfileRow]
     failures: TupleOf[ProfileFailure] = ()
     versions: dict[str, str]
-
-    @classmethod
-    def read(cls, path: Any) -> Self:
-        """Read a file that `write` wrote."""
-        return cls.from_dict(read_json(path), str(path))
-
-    def write(self, path: Any) -> Any:
-        """Write it as JSON, completely or not at all; returns the path."""
-        return write_atomically(path, to_json(self.to_dict()))
 
     @classmethod
     def references(cls) -> dict[str, Self]:

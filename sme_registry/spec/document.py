@@ -321,8 +321,21 @@ def check_digest(stated: str, document: Document, where: str, remedy: str) -> No
         )
 
 
-class DigestedFile(StrictModel):
-    """What a file holds whole, with documents and the digests that they had when it was written."""
+class StoredModel(StrictModel):
+    """What a JSON file holds whole."""
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read and validate a file."""
+        return cls.from_dict(read_json(path), os.fspath(path))
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write it as JSON, completely or not at all."""
+        return write_atomically(path, to_json(self.to_dict()))
+
+
+class DigestedFile(StoredModel):
+    """A file with documents, and the digests that they had when it was written."""
 
     documents: ClassVar[tuple[str, ...]]  # fields, of each of which `<document>_digest` exists
     remedy: ClassVar[str]  # where a digest is of another document
@@ -330,15 +343,11 @@ class DigestedFile(StrictModel):
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file that `write` wrote."""
-        content = cls.from_dict(read_json(path), os.fspath(path))
+        content = super().read(path)
         for name in content.documents:
             stated, where = getattr(content, f"{name}_digest"), f"{path}: {name}_digest"
             check_digest(stated, getattr(content, name), where, cls.remedy)
         return content
-
-    def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write it as JSON, completely or not at all."""
-        return write_atomically(path, to_json(self.to_dict()))
 
 
 def without_empty(plain: dict[str, Any], *names: str) -> dict[str, Any]:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from typing import Annotated, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from sme_registry.errors import (
-    DigestMismatchError,
-    MalformedDocumentError,
-    SpecError,
-)
-from sme_registry.io import read_json, to_json, write_atomically
+from sme_registry.errors import MalformedDocumentError, SpecError
 from sme_registry.spec.document import (
     Digest,
     Integer,
     Name,
     NamedDocument,
+    StoredModel,
     StrictModel,
+    check_digest,
 )
 from sme_registry.spec.sme_spec import SMESpec
 from sme_registry.spec.stream import StreamSpec
@@ -52,7 +48,7 @@ class Fingerprint(StrictModel):
     potential: _ROWS | None = None
 
 
-class Envelope(StrictModel):
+class Envelope(StoredModel):
     """The fields of every file next to its document.
 
     Attributes:
@@ -96,23 +92,9 @@ class Envelope(StrictModel):
         if isinstance(data, dict) and data:
             _check_is_file(cls, data, name, remedy)
         envelope = super().from_dict(data, source)
-        expected = envelope.document.digest
-        if envelope.digest != expected:
-            raise DigestMismatchError(
-                f"{name}: digest={envelope.digest!r}: its {cls.content} has {expected!r}. The "
-                f"{cls.content} or the digest was changed after the file was written: take the "
-                f"file again from its source, or {remedy}."
-            )
+        remedy = f"Take the file again from its source, or {remedy}."
+        check_digest(envelope.digest, envelope.document, f"{name}: digest", remedy)
         return envelope
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read and validate a file."""
-        return cls.from_dict(read_json(path), str(path))
-
-    def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the file completely or not at all."""
-        write_atomically(path, to_json(self.to_dict()))
 
 
 class Resolved(NamedTuple, Generic[_D]):

@@ -33,7 +33,6 @@ from sme_registry.io import (
     file_lock,
     is_locked,
     read_arrays,
-    read_json,
     to_json,
     write_arrays,
     write_atomically,
@@ -120,14 +119,14 @@ class Ledger:
     ) -> None:
         """Write a cell's result or failure, completely or not at all."""
         if isinstance(entry, CellFailure):
-            write_atomically(self.failure_path(entry.key), to_json(entry.to_dict()))
+            entry.write(self.failure_path(entry.key))
             return
         # Models first: a kill in between must not leave a result without them.
         for name, snapshot in snapshots.items():
             write_atomically(self.snapshots_path(entry.key) / name, snapshot)
         if model is not None:
             write_atomically(self.model_path(entry.key), model)
-        write_atomically(self._path(CELLS, entry.key), to_json(entry.to_dict()))
+        entry.write(self._path(CELLS, entry.key))
         with contextlib.suppress(FileNotFoundError):
             self.failure_path(entry.key).unlink()
 
@@ -215,7 +214,7 @@ def _hex(key: str) -> str:
 
 def _read_entry(kind: type[_Entry], path: Path, key: str) -> _Entry:
     """Read a file's entry; an `SMEError` if it is invalid or belongs to another cell."""
-    entry = kind.from_dict(read_json(path), str(path))
+    entry = kind.read(path)
     if not key == entry.key == entry.cell.digest:
         raise OptionError(f"{path}: belongs to the cell {entry.cell.digest}, not to its file name.")
     return entry

@@ -30,6 +30,7 @@ from sme_registry.spec.document import (
     Integer,
     Real,
     SchemaVersion,
+    StoredModel,
     StrictModel,
     without_empty,
 )
@@ -102,7 +103,7 @@ class OfflineCell(StrictModel):
     similarity_sd: Real
 
 
-class CellResult(StrictModel):
+class CellResult(StoredModel):
     """A finished run.
 
     Attributes:
@@ -173,7 +174,7 @@ def report_of_life(life: CellResult, results: Mapping[str, CellResult]) -> Strea
     return report.with_fresh([result.any_report for result in fresh], costs if known else None)
 
 
-class CellFailure(StrictModel):
+class CellFailure(StoredModel):
     """A run that raised an error: its message and the last lines of its traceback."""
 
     schema_version: SchemaVersion = 1

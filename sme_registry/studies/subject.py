@@ -22,7 +22,6 @@ from sme_registry.diagnosis.subject import (
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.models import load_sb3
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.io import read_json
 from sme_registry.spec.study import Cell
 from sme_registry.studies.ledger import CELLS, Ledger
 from sme_registry.studies.result import CellResult, LearningCurve, report_of_life
@@ -76,7 +75,7 @@ def find_result(study: str | Path, key: str) -> CellResult:
             f"{_MIN_DIGITS} or more digits that match only one, such as "
             f"{results[0].stem[:_SHOWN_DIGITS]}."
         )
-    return CellResult.from_dict(read_json(matches[0]), str(matches[0]))
+    return CellResult.read(matches[0])
 
 
 def _life(name: str, result: CellResult, ledger: Ledger, known: dict[str, Any]) -> StreamSubject:

@@ -71,7 +71,7 @@ def test_a_changed_spec_or_digest_is_noticed(saved):
     message = str(caught.value)
     assert str(saved) in message
     assert SMESpec.from_dict(fields).digest in message
-    assert "take the file again from its source, or save the changed spec as a new file" in message
+    assert "Take the file again from its source, or save the changed spec as a new file" in message
     fields["seed"] = 5
     with pytest.raises(DigestMismatchError):
         sme_registry.load(changed(saved, spec=fields, digest="sha256:" + "0" * 64))
