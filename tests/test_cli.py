@@ -30,10 +30,6 @@ from tests.commands import good, refused, sme
 
 SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
 KINDS = (EnvFile, StreamFile, SuiteFile, ProtocolFile, StudyFile)
-COMMANDS = [
-    *("list", "show", "new", "check", "train"),
-    *("evaluate", "diagnose", "study", "data", "demo"),
-]
 
 
 @pytest.fixture(autouse=True)
@@ -100,9 +96,7 @@ def test_train_takes_a_task_or_a_suite_and_refuses_options_of_the_other():
     assert not list(Path().iterdir())
 
 
-def test_help_lists_every_command_and_the_version_is_the_packages():
-    text = good("--help").stdout
-    assert all(command in text for command in COMMANDS)
+def test_the_version_is_the_packages():
     assert good("--version").stdout.strip() == f"sme {sme_registry.__version__}"
 
 
@@ -362,12 +356,6 @@ class TestNew:
         assert file.digest in good("check", "mine.json", "--files-only").stdout
         good("new", "plain.json")
         assert load(tmp_path / "plain.json") == SMESpec()
-
-    def test_every_field_of_a_spec_has_an_option_with_a_description(self):
-        text = good("new", "--help").stdout
-        for field in SMESpec.model_fields.keys() - {"schema_version"}:
-            assert f"--{field.replace('_', '-')} " in text
-        assert "None" not in text
 
     def test_from_derives_and_its_file_is_loaded_by_its_path(self, tmp_path):
         printed = good("new", "a.json", "--from", "HardDeep", "--k", "5").stdout
