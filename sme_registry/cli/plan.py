@@ -55,8 +55,7 @@ from sme_registry.studies.ledger import Ledger
 from sme_registry.training.algorithms import (
     AGENTS,
     BACKENDS,
-    check_algorithm,
-    code_notice,
+    check_algorithms,
     folder_name,
     nested_hyperparameters,
     parse_uses,
@@ -267,8 +266,7 @@ def plan(
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
-    check_algorithms(file.plan, planned, SMEError)
-    warn_of_uneven_rollouts(file.plan)
+    _warn(file.plan, planned, SMEError)
     estimator = Estimator(results.values())
     waiting = [cell for key, cell in cells.items() if key not in results]
     of_cells = [estimator.seconds(cell) for cell in waiting]
@@ -336,22 +334,12 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
     return Table.of(title, rows, caption=caption)
 
 
-def check_algorithms(
-    plan: StudyPlan, planned: Sequence[PlannedCell], errors: type[SMEError]
-) -> None:
-    """Check the algorithms of planned cells; warn about those that raise such an error."""
-    names = {cell.algorithm for cell in planned}
-    algorithms = [algorithm for algorithm in plan.algorithms if algorithm.name in names]
-    if notice := code_notice(algorithm.uses for algorithm in algorithms):
-        print_note(escape(notice))
-    messages = []
-    for algorithm in algorithms:
-        try:
-            check_algorithm(algorithm, planned)
-        except errors as error:
-            messages.append(str(error))
+def _warn(plan: StudyPlan, planned: Sequence[PlannedCell], errors: type[SMEError]) -> None:
+    """Warn of algorithms that raise such an error here, and of uneven rollouts."""
+    messages = check_algorithms(plan, planned, lambda text: print_note(escape(text)), errors)
     for message in unique(messages):  # several algorithms may lack the same package
         print_note(f"[yellow]cannot run here:[/] {escape(message)}")
+    warn_of_uneven_rollouts(plan)
 
 
 def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
@@ -410,8 +398,7 @@ def new(
         named = isinstance(data, dict) and "name" in data
         file = StudyFile.with_digest(data, source, **({} if named else default_name) | about)
     # A package that is not installed here may be installed where the plan runs.
-    check_algorithms(file.plan, file.plan.cells, MissingDependencyError)
-    warn_of_uneven_rollouts(file.plan)
+    _warn(file.plan, file.plan.cells, MissingDependencyError)
     file.write(path)
     print_line(f"{escape(str(path))}  {file.digest}")
     err().print(f"[dim]To see its runs and times: sme study plan {escape(str(path))}[/]")

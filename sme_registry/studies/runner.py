@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Console
-from rich.markup import escape
 
 from sme_registry.errors import OptionError
 from sme_registry.io import Lock, integer_in
@@ -24,8 +23,7 @@ from sme_registry.studies.ledger import Ledger, StudyStatus, label, plan_status
 from sme_registry.studies.result import CPU, CellFailure, CellResult, Job, Outcome
 from sme_registry.training.algorithms import (
     backend_of,
-    check_algorithm,
-    code_notice,
+    check_algorithms,
     imported,
     needs_device,
 )
@@ -84,7 +82,12 @@ def run_study(
         planned.setdefault(place.cell.digest, place)
     console = console or err()
     checked = planned.values() if run is run_cell else ()
-    _check(plan_file.plan, checked, console if progress else None)
+
+    def say(text: str) -> None:
+        if progress:
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    check_algorithms(plan_file.plan, checked, say)
     if not isinstance(executor, Executor):
         executor = executor_type(executor, ray)(jobs, run, keep_models, ray)
     programs = _programs(plan_file.plan, checked, device, lanes, local=executor.local)
@@ -107,16 +110,6 @@ def run_study(
             f"{ledger.folder}. Run the same command to continue."
         ) from None
     return plan_status(ledger, plan_file, only)
-
-
-def _check(plan: StudyPlan, planned: Collection[PlannedCell], console: Console | None) -> None:
-    names = {cell.algorithm for cell in planned}
-    algorithms = [algorithm for algorithm in plan.algorithms if algorithm.name in names]
-    notice = code_notice(algorithm.uses for algorithm in algorithms)
-    if notice and console is not None:
-        console.print(escape(notice), highlight=False, soft_wrap=True)
-    for algorithm in algorithms:
-        check_algorithm(algorithm, planned)
 
 
 def _programs(

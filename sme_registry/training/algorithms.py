@@ -24,7 +24,7 @@ import importlib.metadata
 import inspect
 import io
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -32,11 +32,11 @@ from pydantic import ConfigDict, Field, create_model
 
 from sme_registry.datasets import documents
 from sme_registry.envs.arguments import check_has_limits
-from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, SMEError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import OLD_NAMES, POLICIES
 from sme_registry.io import choice, import_object, require_packages
 from sme_registry.io.system import missing_dependency, module_file
-from sme_registry.spec import SMESpec, StreamSpec, StudyAlgorithm
+from sme_registry.spec import SMESpec, StreamSpec, StudyPlan
 from sme_registry.spec.document import Integer, Real, StrictModel
 from sme_registry.spec.study import PlannedCell
 
@@ -264,14 +264,6 @@ def folder_name(uses: str) -> str:
     return f"{kind}-{short_name(uses)}" if kind in AGENTS[1:] else short_name(uses)
 
 
-def code_notice(uses: Iterable[str]) -> str:
-    """Whose code runs to find these algorithms; empty where they name no modules that are here."""
-    names = (parse_uses(each)[1] for each in uses)
-    modules = dict.fromkeys(name.partition(":")[0] for name in names if ":" in name)
-    here = [module for module in modules if module_file(module)]
-    return f"This plan runs the code of {', '.join(here)}." if here else ""
-
-
 def check_hyperparameters(
     uses: str,
     hyperparameters: Mapping[str, Any],
@@ -301,13 +293,34 @@ def check_hyperparameters(
         raise OptionError(str(error)) from None
 
 
-def check_algorithm(algorithm: StudyAlgorithm, planned: Iterable[PlannedCell]) -> None:
-    """Check an algorithm of a plan, and that it can learn the tasks of its cells."""
+def check_algorithms(
+    plan: StudyPlan,
+    planned: Collection[PlannedCell],
+    say: Callable[[str], object],
+    tolerated: type[SMEError] | tuple[()] = (),
+) -> list[str]:
+    """Check the algorithms of planned cells, and that they can learn their tasks.
+
+    Says first whose code runs to find them. Returns the messages of errors that are tolerated.
+    """
+    tasks: dict[str, list[Document]] = {}
     for place in planned:
-        if place.algorithm == algorithm.name:
-            find(algorithm.uses).check_task(place.cell.document)
-    field = f"algorithm {algorithm.name!r}: hyperparameters"
-    check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
+        tasks.setdefault(place.algorithm, []).append(place.cell.document)
+    algorithms = [algorithm for algorithm in plan.algorithms if algorithm.name in tasks]
+    names = [parse_uses(algorithm.uses)[1] for algorithm in algorithms]
+    modules = dict.fromkeys(name.partition(":")[0] for name in names if ":" in name)
+    if here := [module for module in modules if module_file(module)]:
+        say(f"This plan runs the code of {', '.join(here)}.")
+    messages = []
+    for algorithm in algorithms:
+        field = f"algorithm {algorithm.name!r}: hyperparameters"
+        try:
+            for task in tasks[algorithm.name]:
+                find(algorithm.uses).check_task(task)
+            check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
+        except tolerated as error:
+            messages.append(str(error))
+    return messages
 
 
 def load_algorithm(name: str) -> Any:
