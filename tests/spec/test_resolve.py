@@ -14,16 +14,13 @@ import sme_registry
 from sme_registry import load
 from sme_registry.cli.task import sweep_axes
 from sme_registry.errors import MalformedDocumentError, SMEError, SpecError, UnknownNameError
-from sme_registry.spec import EnvFile, SMESpec, StreamFile, SuiteFile, catalogue
+from sme_registry.spec import EnvFile, SMESpec, SuiteFile, catalogue
 from sme_registry.spec.catalogue import resolve
 from sme_registry.spec.document import Integer, StrictModel, summary
 from sme_registry.spec.study import sweep
 
 DEFAULT = catalogue.find(EnvFile, "Default-v1")
 FOLDER = catalogue.spec_folder()
-
-
-STREAM = catalogue.find(StreamFile, "Cycle2-v1")
 
 
 def test_every_name_of_the_default_task_leads_to_it(tmp_path):
@@ -49,12 +46,6 @@ def test_every_name_of_the_default_task_leads_to_it(tmp_path):
         assert resolve(name).document == SMESpec()
     for spec in catalogue.entries(SuiteFile)[0].suite.instances[:3]:
         assert resolve(spec.digest[:19]).document == spec
-
-
-def test_names_lead_to_streams_too():
-    path = FOLDER / "streams" / "Cycle2-v1.json"
-    for name in ("Cycle2", STREAM.digest, STREAM.stream, STREAM.stream.to_dict(), str(path)):
-        assert resolve(name).document == STREAM.stream
 
 
 def test_specs_of_named_files_carry_their_fingerprint_and_others_none():

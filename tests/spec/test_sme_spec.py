@@ -178,13 +178,6 @@ class TestTeams:
 
 
 class TestSuites:
-    def test_the_instances_of_a_class_are_its_setting_under_each_seed(self):
-        member = SuiteClass(name="deep", setting={"complexity": 10}, seeds=[3, "0x2"])
-        assert member.instances == (
-            SMESpec(complexity=10, seed=3),
-            SMESpec(complexity=10, seed="0x2"),
-        )
-
     def test_a_setting_with_a_seed_is_refused_as_it_would_be_lost(self):
         with pytest.raises(SpecError, match=r"setting\.seed=3"):
             SuiteClass(name="deep", setting=SMESpec(seed=3), seeds=[1])
