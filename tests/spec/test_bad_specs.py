@@ -186,6 +186,14 @@ def test_deriving_refuses_as_parsing_does_and_a_source_begins_its_error():
             {"classes": [{"name": "a", "setting": {}, "seeds": [i]} for i in (1, 2)]},
             "classes: the name 'a' appears twice.",
         ),
+        (
+            Suite,
+            {
+                "classes": [{"name": "a", "setting": {}, "seeds": [1]}],
+                "streams": [{"name": "a", "stream": "Cycle2"}],
+            },
+            "streams: the name 'a' appears twice.",
+        ),
         (EvaluationProtocol, {"epsilons": [0.0]}, "epsilons=[0.0]: must increase, from above 0."),
         (EvaluationProtocol, {"states_per_region": 1}, "states_per_region=1: must be in [2, "),
         (EnvFile, SMESpec().to_dict(), "digest: missing: must be the digest of the spec."),
