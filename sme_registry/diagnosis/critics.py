@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sme_registry.datasets.offline import CRITICS, POLICY
+from sme_registry.diagnosis.measure import states_of
 from sme_registry.envs.arguments import single_agent
 from sme_registry.envs.batch import Batch
 from sme_registry.errors import PolicyError
@@ -243,13 +244,12 @@ def critic(model: Any, task: SpecLike | Task, *, states: int = 500, seed: int = 
       >>> report.kind
       'V'
     """
-    task = single_agent(task if isinstance(task, Task) else load_task(task))
+    task = single_agent(load_task(task))
     integer_in("states", states, 1)
     learnt = _critic_of(model, task, seed)
-    protocol = EvaluationProtocol(states_per_region=states, seed=seed)
     points = {VISITED: _visited(task, learnt, states, seed)} | {
-        regions.region_name(region): _drawn(task, protocol, region)
-        for region in range(len(protocol.epsilons) + 1)
+        regions.region_name(region): _drawn(task, states, seed, region)
+        for region in range(len(EvaluationProtocol().edges))
     }
     levels: dict[str, _Levels] = {}
     if isinstance(learnt, _Critic):
@@ -276,8 +276,7 @@ def ranking_in_cube(model: Any, task: Task, states: int, seed: int) -> float | N
     learnt = _critic_of(model, task, seed)
     if learnt.kind == "V":
         return None
-    protocol = EvaluationProtocol(states_per_region=states, seed=seed)
-    return _rankings(task, learnt, _drawn(task, protocol, 0), seed)[0]
+    return _rankings(task, learnt, _drawn(task, states, seed), seed)[0]
 
 
 def has_critic(model: Any, task: Task) -> bool:
@@ -320,9 +319,9 @@ def _to_unit(symmetric: Any) -> Array:
     return np.asarray((np.asarray(symmetric, np.float64) + 1.0) / 2.0)
 
 
-def _drawn(task: Task, protocol: EvaluationProtocol, region: int) -> _Points:
+def _drawn(task: Task, states: int, seed: int, region: int = 0) -> _Points:
     """States of a region at uniform times, with nothing accumulated."""
-    (batch,) = regions.states(protocol, region, task.spec, protocol.states_per_region)
+    batch = states_of(task.spec, states, seed, region)
     t = np.floor(batch.time * task.spec.horizon).astype(np.int64)
     return _Points.of(task, np.asarray(batch.s, np.float64), t, np.zeros(len(t)), batch.d)
 

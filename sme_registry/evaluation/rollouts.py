@@ -221,7 +221,7 @@ def values(
       >>> sme_registry.values("Default", "optimal", states, gamma=1.0, t=[0, 90])
       array([100.,  10.])
     """
-    task = single_agent(task if isinstance(task, Task) else load_task(task))
+    task = single_agent(load_task(task))
     spec = task.spec
     choice("horizon", horizon, ("finite", "continuing"))
     integer_in("samples", samples, 1)

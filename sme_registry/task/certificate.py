@@ -194,8 +194,7 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
       True
     """
     seed = integer_in("seed", seed, 0, 2**53 - 1, advice="Leave it out for 0.")
-    if not isinstance(task, Task):
-        task = load_task(task)
+    task = load_task(task)
     S, A, m = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
     lanes = max(256, min(_LANES, 2**24 // (S * A)))
     states = max(2_000, min(_STATES, 2**26 // (S + m + task.spec.hidden_width)))

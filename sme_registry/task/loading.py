@@ -121,11 +121,13 @@ def save(
     return Path(path)
 
 
-def load_task(task: SpecLike, **overrides: Any) -> Task:
-    """Draw the task of a name or spec; one of a file must have its file's fingerprint.
+def load_task(task: Task | SpecLike, **overrides: Any) -> Task:
+    """The task itself, or that of a name or spec; of a file it must have the file's fingerprint.
 
     A derived task, with `overrides` of fields, has no published numbers.
     """
+    if isinstance(task, Task) and not overrides:
+        return task
     resolved = resolve(task, SMESpec)
     fingerprints = () if overrides else resolved.fingerprints
     return materialize(resolved.document.derive(**overrides), *fingerprints)
