@@ -173,13 +173,3 @@ def test_findings_are_sorted_by_their_share_of_the_error():
     assert shares == sorted(shares, reverse=True)
     assert 1 < len(shares) < len(answers)
     assert answers[len(shares) :] == ["yes"] * (len(answers) - len(shares))
-
-
-@pytest.mark.parametrize(("updates", "answer"), [(None, "yes"), (19, "cannot tell"), (20, "yes")])
-def test_a_cause_needs_twenty_updates_of_the_algorithm(updates, answer):
-    spec = SPEC.derive(r_min=0.75)
-    measured = diagnosis_of(shrunk, spec, states=64).measurements
-    verdicts = verdicts_on(measured, spec, updates=updates)
-    (sparsity,) = (verdict for verdict in verdicts if verdict.question == "sparsity")
-    assert sparsity.answer == answer
-    assert ("19 times" in sparsity.sentence()) == (updates == 19)
