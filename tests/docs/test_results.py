@@ -85,3 +85,17 @@ def test_the_numbers_of_a_table_are_those_of_the_committed_rows(page, begin, end
 
 def as_numbers(rows):
     return {tuple(map(float, row)) for row in rows}
+
+
+@pytest.mark.parametrize(("means", "lives"), [("metrics", "lives"), ("visits", "lives-visits")])
+def test_interquartile_means_of_lives_are_those_of_their_committed_rows(means, lives):
+    pandas, stats = pytest.importorskip("pandas"), pytest.importorskip("scipy.stats")
+    means, lives = (pandas.read_csv(RESULTS / "continual" / f"{n}.csv") for n in (means, lives))
+    means = means[(means["region"] == "WD") & (means["algorithm"] == "PPO")]
+    columns = [name for name in ("class_name", "visit") if name in means]
+    compared = means[means["metric"].isin(lives.columns)]
+    assert len(compared) > 20
+    for _, row in compared.iterrows():
+        of_row = lives[(lives[columns] == row[columns].to_numpy()).all(axis=1)][row["metric"]]
+        assert row["runs"] == len(of_row) == 5
+        assert stats.trim_mean(of_row, 0.25) == pytest.approx(row["iqm"], abs=2e-6)
