@@ -131,7 +131,8 @@ five draws of each level. `sme profile` shows your own algorithm beside them, an
 `sme profile show PPO` one of them. Agents are in JAX, with the default hyperparameters of
 Stable-Baselines3; γ = 0 is their strongest setting where nothing but the present step matters, and
 their weakest on reward intervals and foresight. `linear` is the linear policy nearest to the
-optimum, and does not learn.
+optimum, and does not learn; a random policy has N₀ of about 1.3 at each level, 1.55 at A = 16.
+PPO trains in whole rollouts, so for 20,480 steps.
 
 ![PPO and other references over the levels of nine axes](../../figures/profiles.png)
 
@@ -149,7 +150,7 @@ The mean over the harder levels of 1 − N₀ there, divided by 1 − N₀ at th
 _ORIGIN = """
 ## Origin
 
-Made by `docs/results/profiles.py`, from the plan `profile-v1`.
+Made by `docs/results/profiles.py`, from the plan `profile-v1` (`{digest}`).
 
 | Profile | `uses` | runs | versions |
 |---|---|---|---|"""
@@ -170,7 +171,8 @@ def profiles() -> str:
         regret.append(f"{place}{' | '.join(texts)} |")
         kept = [str(each.robustness(axis)) for each in references.values()]
         robustness.append(f"{place}{' | '.join(kept)} |")
-    lines = [_PROFILES, *regret, _ROBUSTNESS, *robustness, _ORIGIN]
+    origin = _ORIGIN.format(digest=_short(references["PPO"].plan_digest))
+    lines = [_PROFILES, *regret, _ROBUSTNESS, *robustness, origin]
     for name, each in references.items():
         versions = ", ".join(f"{package} {v}" for package, v in sorted(each.versions.items()))
         runs = f"{len(each.rows)} of {each.planned}"

@@ -81,8 +81,8 @@ _LIVES = {
         "was shown neither better nor worse on phases before their first visit",
     ),
     "learning_transfer": (
-        "learns faster in its visits than a fresh agent",
-        "learns more slowly in its visits than a fresh agent",
+        "has less regret during its visits than a fresh agent",
+        "has more regret during its visits than a fresh agent",
         "was shown neither ahead of nor behind a fresh agent in its visits",
     ),
 }  # fmt: skip

@@ -322,7 +322,7 @@ def changed(analysis, metric, ends, runs=5):
         ("forgetting", (0.2, -0.1, 0.5), "open", "was not shown to forget"),
         ("forgetting", (-0.2, -0.3, -0.1), "below", "better on earlier phases"),
         ("forgetting", (0.4, 0.2, 0.6), "above", "forgets: forgetting 0.40 (95 % interval 0.20 to"),
-        ("learning_transfer", (0.4, 0.2, 0.6), "above", "learns faster in its visits"),
+        ("learning_transfer", (0.4, 0.2, 0.6), "above", "has less regret during its visits"),
         ("forward_transfer", (-0.2, -0.3, -0.1), "below", "worse on phases before their first"),
     ],
 )

@@ -63,7 +63,7 @@ _BESIDE = {  # a life, in the colour of its algorithm: label, look, caption
     "fresh": (
         "fresh agents", new_look(GREY, dash=(0, (5, 1.2, 1, 1.2))),
         " Dash-dotted, in the colour of the algorithm: agents that start anew in each visit, "
-        "spread evenly over it. A life below that line learns faster than fresh agents.",
+        "spread evenly over it. A life below that line has less regret than fresh agents.",
     ),
     "frozen": (
         LABELS["frozen_agent"], new_look(GREY, dash=(0, (2.5, 1.2))),
