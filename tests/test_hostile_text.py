@@ -186,6 +186,10 @@ def test_pipes_and_devices_are_refused_at_once(folder):
         for name, within in (("submission.json", "bundle"), ("season.json", "season")):
             (folder / within / name).unlink(missing_ok=True)
             (folder / within / name).symlink_to(folder / special)
+        for suffix in ("npy", "npz", "onnx", "zip"):
+            for instance in ("deep-0", "deep-1"):
+                (folder / f"{instance}.{suffix}").unlink(missing_ok=True)
+                (folder / f"{instance}.{suffix}").symlink_to(folder / special)
         for line in (
             f"submit {special} board",
             "submit bundle board",
@@ -195,7 +199,10 @@ def test_pipes_and_devices_are_refused_at_once(folder):
             f"enter board {special} constant --method X --submitter Y",
             "enter board season constant --method X --submitter Y",
             f"enter board good {special} --method X --submitter Y",
-            f"enter board good {special}.npy --method X --submitter Y",
+            "enter board good {name}.npy --method X --submitter Y",
+            "enter board good {name}.npz --method X --submitter Y",
+            "enter board good {name}.onnx --method X --submitter Y",
+            "enter board good {name}.zip --method X --submitter Y",
             f"enter board good constant --method X --submitter Y --key {special}",
             f"answer http://127.0.0.1:1 {special} constant",
             f"season new board {special}",

@@ -55,7 +55,15 @@ from leaderboard.store import Store
 from leaderboard.web.client import Files
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
-from sme_registry.io import build_folder, read_json, read_regular, sha256_of, to_json, versions
+from sme_registry.io import (
+    build_folder,
+    open_regular,
+    read_json,
+    read_regular,
+    sha256_of,
+    to_json,
+    versions,
+)
 from sme_registry.seasons.wire import Hidden, table_bytes
 from sme_registry.task.engine import chosen_backend
 
@@ -137,15 +145,24 @@ def copy_published(season: Season, source: Path, target: Path) -> None:
         return
     target.parent.mkdir(parents=True, exist_ok=True)
     with build_folder(target) as building:
-        shutil.copy(source / SEASON, building)
-        for hidden in season.hidden:
-            path = challenge_path(Path(building), hidden)
-            path.parent.mkdir(exist_ok=True)
-            shutil.copy(challenge_path(source, hidden), path)
-            shutil.copytree(
-                dataset_path(source, season.id, hidden),
-                dataset_path(Path(building), season.id, hidden),
-            )
+        for path in _published_files(season):
+            (building / path).parent.mkdir(parents=True, exist_ok=True)
+            try:
+                stream = open_regular(source / path)
+            except OSError as error:
+                raise BoardError(
+                    f"{source / path}: cannot be read: {error.strerror}. Create the season again."
+                ) from None
+            with stream, open(building / path, "wb") as copy:
+                shutil.copyfileobj(stream, copy)
+
+
+def _published_files(season: Season) -> Iterator[Path]:
+    """The paths of all that is published of a season."""
+    yield Path(SEASON)
+    for hidden in season.hidden:
+        yield challenge_path(Path(), hidden)
+        yield from (dataset_path(Path(), season.id, hidden) / name for name in SealedDataset.FILES)
 
 
 def files_of_seasons(store: Store) -> Iterator[Files]:

@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -123,6 +123,8 @@ class SealedDataset(AlignedArrays):
     are true where an episode ended at the horizon, or the data set does: bootstrap, unless the same
     row terminates.
     """
+
+    FILES: ClassVar = (f"data/{DATA}", f"data/{METADATA}")  # in its folder
 
     observations: Observation
     actions: npt.NDArray[np.float32]

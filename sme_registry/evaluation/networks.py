@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError, PolicyError, SMEError
-from sme_registry.io import choice, parse_json, to_json, write_atomically
+from sme_registry.io import choice, parse_json, read_regular, to_json, write_atomically
 from sme_registry.task.task import Observation
 
 Weights = npt.NDArray[np.float32]
@@ -183,11 +183,12 @@ class OfflinePolicy(Perceptron):
 
     @classmethod
     def _read(cls, path: str | os.PathLike[str]) -> Self:
-        with zipfile.ZipFile(path) as members:
+        data = read_regular(path, _MAX_BYTES, links=True)
+        with zipfile.ZipFile(io.BytesIO(data)) as members:
             unpacked = sum(member.file_size for member in members.infolist())
-        if max(unpacked, os.path.getsize(path)) > _MAX_BYTES:
+        if unpacked > _MAX_BYTES:
             raise PolicyError(f"larger than {_MAX_BYTES // 2**20} MiB.")
-        with np.load(path, allow_pickle=False) as stored:
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             about = parse_json(stored["about"].tobytes())
             count = sum(name.startswith("W") for name in stored.files)
             layers = [(stored[f"W{i}"], stored[f"b{i}"]) for i in range(count)]

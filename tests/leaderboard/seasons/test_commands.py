@@ -98,6 +98,23 @@ def test_a_season_is_played_from_the_command_line(later):
     assert "None" not in good("season", "show", "board", "autumn")
 
 
+@pytest.mark.parametrize("target", ["my.key", "/dev/zero"])
+def test_only_the_files_of_a_season_are_published(target):
+    """A link in its folder could add a private file, or a device that has no end."""
+    good("season", "new", "board", PLAN)
+    data = Path("autumn/datasets/sealed/autumn/deep-1-v0/data")
+    (data / "more").symlink_to(Path(target).absolute())
+    if target == "my.key":
+        good("season", "publish", "board", "autumn")
+        assert not list(Path("board").rglob("more"))
+        return
+    (data / "metadata.json").unlink()
+    (data / "metadata.json").symlink_to(target)
+    (data / "more").unlink()
+    shown = fails(2, "season", "publish", "board", "autumn")
+    assert "metadata.json: cannot be read: is not a regular file" in shown
+
+
 def test_a_class_that_a_table_solves_is_warned_of_and_a_false_plan_is_refused(tmp_path):
     fields = json.loads(Path(PLAN).read_text())
     setting = fields["classes"][0]["setting"]
