@@ -9,10 +9,11 @@ import urllib.request
 from glob import glob
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sme_registry import load
+from sme_registry import load, make
 from sme_registry.spec import NoiseSpec, ObservationSpec, SafetySpec, ShapingSpec, SMESpec
 from sme_registry.studies.executors import InProcess, Processes
 from sme_registry.task.certificate import certify
@@ -238,6 +239,19 @@ def test_the_example_of_the_readme_prints_what_stands_below_it(capsys):
     exec(compile(code, "README.md", "exec"), {"__name__": "page"})
     assert capsys.readouterr().out == output
     assert len(readme.split()) <= 900
+
+
+def test_the_function_of_the_readme_acts_on_every_level_of_a_profile():
+    source = re.search(
+        r"```python\n([^`]*?def train.*?)```", (ROOT / "README.md").read_text(), re.S
+    )
+    namespace = {"__name__": "page"}
+    exec(compile(source[1], "README.md", "exec"), namespace)
+    for name in ("Default", "ActionDim16", "StateDim64"):
+        env = make(name)
+        policy = namespace["train"](env, 100, 0)
+        observations = np.zeros((3, *env.observation_space.shape))
+        assert policy(observations).shape == (3, *env.action_space.shape), name
 
 
 def test_the_table_of_fields_has_every_field_its_default_and_its_meaning():

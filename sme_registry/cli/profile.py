@@ -117,6 +117,8 @@ def profile(
             f"[red]failed[/] {escape(failure.class_name)}, run {failure.run}: "
             f"{escape(failure.error)}"
         )
+    if len(made.failures) > 3:
+        print_note(f"{len(made.failures) - 3} more failed runs are in the page.")
     if made.failures:
         raise typer.Exit(1)
 

@@ -17,13 +17,13 @@ in pairs: on the same draw of a level with the same seed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
-from sme_registry.io.markup import Table, card, conjunction, fixed, signed, table_html
+from sme_registry.io.markup import Table, card, conjunction, fixed, plural, signed, table_html
 from sme_registry.profiles.levels import AXES, DEFAULT, Axis, plan_file
 from sme_registry.spec import StudyAlgorithm
 from sme_registry.spec.document import Digest, Integer, Real, StoredModel, StrictModel, TupleOf
@@ -39,6 +39,7 @@ REFERENCES = Path(__file__).parent / "references"
 UNLEARNT = THRESHOLDS["unlearnt"]
 DIGITS = 6
 _HALF = 0.5
+_NAMED = 3  # axes, in one sentence
 COMPARED = "PPO", "TD3", "SAC"  # in sentences; others are in figures and tables
 
 
@@ -170,10 +171,14 @@ class Profile(StoredModel):
         runs = np.array([[value] for value in values.values()])
         return self._estimate(runs, iqm, "level", class_name, field)
 
-    def robustness(self, axis: Axis) -> DrawEstimate:
-        """What is kept of the performance at the harder levels, over draws that have all levels."""
-        levels = [self.values(name) for name in axis.levels if name in self.classes]
-        known = axis.base in self.classes and len(levels) > 1
+    def robustness(self, axis: Axis, within: Iterable[str] | None = None) -> DrawEstimate:
+        """What is kept of the performance at the harder levels, over draws that have all levels.
+
+        `within` has the levels that count, such as those of a quick profile; by default all.
+        """
+        asked = {*self.classes} if within is None else {*self.classes}.intersection(within)
+        levels = [self.values(name) for name in axis.levels if name in asked]
+        known = axis.base in asked and len(levels) > 1
         draws = sorted(set[int].intersection(*map(set, levels))) if known else []
         runs = np.array([[of_level[draw] for of_level in levels] for draw in draws])
         if draws and float(iqm(runs)[0]) >= UNLEARNT:
@@ -189,11 +194,15 @@ class Profile(StoredModel):
 
     def steps_to_half(self, class_name: str = DEFAULT) -> float | None:
         """The median over draws; infinite where it was not reached, None if it is unknown."""
+        steps = self._steps_to_half(class_name)
+        return float(np.quantile(steps, 0.5, method="higher")) if steps else None
+
+    def _steps_to_half(self, class_name: str) -> list[float]:
+        """Of each draw; none if it does not learn, or was evaluated at its end alone."""
         rows = [row for row in self.rows if row.class_name == class_name]
-        if not rows or any(row.evaluations < 2 and self.learns for row in rows):
-            return None
-        steps = [math.inf if row.steps_to_half is None else row.steps_to_half for row in rows]
-        return float(np.quantile(steps, 0.5, method="higher"))
+        if not self.learns or any(row.evaluations < 2 for row in rows):
+            return []
+        return [math.inf if row.steps_to_half is None else row.steps_to_half for row in rows]
 
     def contrasts(self, other: Profile) -> dict[str, DrawEstimate]:
         """The differences on the default, and over the harder levels of each axis, by label."""
@@ -227,34 +236,47 @@ class Profile(StoredModel):
         kept = {axis.label: self.robustness(axis) for axis in AXES}
         kept = {label: each for label, each in kept.items() if not math.isnan(each.value)}
         if not kept:
-            return [f"{self.name} learnt too little to lose anything: no robustness is known."]
-        least, most = (f(kept, key=lambda label: kept[label].value) for f in (min, max))
-        text = f"{self.name} breaks most along {least}: it keeps {kept[least]} of its performance"
-        text += f". Least of all it is hurt along {most}: {kept[most]}."
-        few = min(kept[least].draws, kept[most].draws) < ENOUGH_RUNS
+            return [self._no_robustness()]
+        least, *others = sorted(kept, key=lambda label: kept[label].value)
+        text = f"{self.name} breaks most along {least}: it keeps {kept[least]} of its performance."
+        near = [label for label in others if kept[label].low <= kept[least].high]
+        if near:
+            text += f" The intervals along {_listed(near, kept)} overlap with it."
+        if others:
+            text += f" It is hurt least along {others[-1]}: {kept[others[-1]]}."
+        few = min(each.draws for each in kept.values()) < ENOUGH_RUNS
         return [
             f"{text} With fewer than {ENOUGH_RUNS} draws this is an indication." if few else text
         ]
 
+    def _no_robustness(self) -> str:
+        if self.level(DEFAULT).value >= UNLEARNT:
+            text = f"On the default {self.name} is hardly better than the constant ½, or worse"
+            return f"{text}: no robustness is known."
+        return f"No robustness of {self.name} is known: no axis has runs of one draw on all levels."
+
     def _speed(self) -> str:
-        default, half = self.level(DEFAULT), self.steps_to_half()
-        text = f"On the default its N₀ is {default} after {self.steps:,} steps"
+        text = f"On the default its N₀ is {self.level(DEFAULT)}"
+        if not self.learns:
+            return f"{text}; it does not learn."
+        text, half = f"{text} after {self.steps:,} steps", self.steps_to_half()
         if half is None:
             return f"{text}; when it fell to ½ is unknown, as it was evaluated at the end alone."
         if math.isinf(half):
-            return f"{text}; in most draws it never fell to ½."
+            steps = self._steps_to_half(DEFAULT)
+            never = f"{steps.count(math.inf)} of {plural(len(steps), 'draw')}"
+            return f"{text}; in {never} it never fell to ½."
         return f"{text}; it fell to ½ after {half:,.0f} steps, in the median over draws."
 
     def _comparison(self, other: Profile) -> str:
-        parts, contrasts = [], self.contrasts(other)
-        for verdict in ("better", "worse", "indication"):
-            of = {label: each for label, each in contrasts.items() if each.verdict == verdict}
-            if of:
-                ordered = sorted(of, key=lambda label: -abs(of[label].value))
-                texts = [f"{label} ({of[label]})" for label in ordered[:3]]
-                more = [f"{len(of) - 3} more"] if len(of) > 3 else []
-                word = "an indication only on" if verdict == "indication" else f"{verdict} on"
-                parts.append(f"{word} {conjunction([*texts, *more])}")
+        contrasts, groups = self.contrasts(other), dict[str, list[str]]()
+        for label in sorted(contrasts, key=lambda label: -abs(contrasts[label].value)):
+            each = contrasts[label]
+            few = "as an indication only, " if each.verdict == "indication" else ""
+            side = "worse" if each.value > 0 else "better"
+            if each.verdict != "open":
+                groups.setdefault(f"{few}{side} on", []).append(label)
+        parts = [f"{words} {_listed(labels, contrasts)}" for words, labels in groups.items()]
         still = sum(each.verdict == "open" for each in contrasts.values())
         if still:
             parts.append(f"open on {still} of {len(contrasts)}")
@@ -282,9 +304,14 @@ class Profile(StoredModel):
                     "robustness": str(self.robustness(axis)),
                 }
             )
-        draws = f"{self.steps:,} steps, {len(self.rows)} of {self.planned} runs"
+        draws = f"{self.budget}, {len(self.rows)} of {self.planned} runs"
         caption = f"IQM over draws. Fewer than {ENOUGH_RUNS} draws are an indication only."
         return Table.of(f"[bold]{self.name}[/]  {draws}", records, caption=caption)
+
+    @property
+    def budget(self) -> str:
+        """The steps of each training."""
+        return f"{self.steps:,} steps" if self.learns else "no training"
 
     @property
     def planned(self) -> int:
@@ -298,6 +325,13 @@ class Profile(StoredModel):
 
     def _repr_html_(self) -> str:
         return card(table_html(self.table()), *(f"<p>{text}</p>" for text in self.sentences()))
+
+
+def _listed(labels: Sequence[str], estimates: Mapping[str, DrawEstimate]) -> str:
+    """The first three with their estimates, and how many more."""
+    texts = [f"{label} ({estimates[label]})" for label in labels[:_NAMED]]
+    more = [f"{len(labels) - _NAMED} more"] if len(labels) > _NAMED else []
+    return conjunction([*texts, *more])
 
 
 def _kept(runs: Any) -> Array:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from sme_registry.plots.style import GREY, draw_band, literal, new_figure, styled
 from sme_registry.profiles.document import COMPARED, Profile
 from sme_registry.profiles.levels import AXES, Axis
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _HIGHEST = 1.45  # N₀ that the figure shows
-_LEAST = -0.6  # robustness
+_LEAST, _MOST = -0.6, 1.35  # robustness
 
 
 def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, Look]:
@@ -69,30 +71,36 @@ def _draw_line(axes: Axes, profile: Profile, axis: Axis, look: Look, *, front: b
     if front or look["marker"]:
         draw_band(axes, x, low, high, look["color"])
     width, alpha, order = (2.2, 1.0, 3) if front else (1.1, 0.75, 2)
-    axes.plot(x, y, **look, linewidth=width, alpha=alpha, markersize=4, zorder=order)
+    y = np.minimum(y, _HIGHEST)  # of more, the mark is at the edge
+    style = {**look, "linewidth": width, "alpha": alpha, "markersize": 4, "zorder": order}
+    axes.plot(x, y, **style, clip_on=False)
 
 
 @styled()
 def draw_robustness(profile: Profile, others: Sequence[Profile]) -> Figure:
     looks, by_name = _looks(profile, others), {each.name: each for each in (profile, *others)}
+    looks = {
+        name: {**look, "marker": look["marker"] or "D", "linestyle": "none"}
+        for name, look in looks.items()
+    }
     figure = new_figure((WIDTH, 1.2 + 0.36 * len(AXES)))
     axes = figure.add_subplot()
     for name, look, shift in side_by_side(looks, 0.6):
         for row, axis in enumerate(AXES):
-            kept = by_name[name].robustness(axis)
+            kept = by_name[name].robustness(axis, profile.classes)
             if not kept.draws:
                 continue
             front = name == profile.name
-            marker = {**look, "marker": look["marker"] or "|", "linestyle": "none"}
             if not math.isnan(kept.low):
                 width = 1.8 if front else 0.9
                 axes.hlines(row + shift, kept.low, kept.high, color=look["color"], linewidth=width)
             size = 6.0 if front else 4.0
-            axes.plot([kept.value], [row + shift], **marker, markersize=size, zorder=3)
+            value = min(max(kept.value, _LEAST), _MOST)  # of others, the mark is at the edge
+            axes.plot([value], [row + shift], **look, markersize=size, zorder=3, clip_on=False)
     axes.set_yticks(range(len(AXES)), [literal(axis.label) for axis in AXES])
     axes.set_ylim(len(AXES) - 0.4, -0.6)
     axes.axvline(1.0, color="black", linewidth=0.9, zorder=1)
-    axes.set_xlim(_LEAST, 1.35)
+    axes.set_xlim(_LEAST, _MOST)
     axes.set_xlabel("robustness: share of the performance 1 − N₀ that is kept at the harder levels")
     axes.grid(visible=False, axis="y")
     legend(figure, looks)

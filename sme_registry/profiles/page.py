@@ -54,10 +54,14 @@ def write_page(
 def _robustness(profile: Profile, others: Sequence[Profile]) -> TextTable:
     compared = [profile, *(each for each in others if each.name != "constant")]
     rows = [
-        {"axis": axis.label} | {each.name: str(each.robustness(axis)) for each in compared}
+        {"axis": axis.label}
+        | {each.name: str(each.robustness(axis, profile.classes)) for each in compared}
         for axis in AXES
     ]
-    note = "What is kept of the performance at the harder levels, with 95 % intervals over draws."
+    note = (
+        f"What is kept of the performance at the harder levels that {profile.name} has, with 95 % "
+        "intervals over draws."
+    )
     return TextTable("robustness", "Robustness", note, pd.DataFrame(rows))
 
 
@@ -126,7 +130,7 @@ def _origin(profile: Profile, others: Sequence[Profile]) -> Iterator[tuple[str, 
     absent = profile.planned - done - failed
     counts = [f"{done} of {profile.planned} finished"]
     counts += [f"{failed} failed"] * bool(failed) + [f"{absent} not run"] * bool(absent)
-    yield "runs", "", f"{', '.join(counts)}; {profile.steps:,} steps each"
+    yield "runs", "", f"{', '.join(counts)}; {profile.budget}"
     yield "draws", "", f"{profile.seeds} of each level, the seed of training is their number"
     yield "plan", profile.plan_digest, profile.plan
     yield "protocol", profile.protocol_digest, "of N₀ and N̄"

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import sme_registry
 from sme_registry import Profile
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation.evaluate import resolve_protocol
-from sme_registry.profiles import document, levels, run
+from sme_registry.profiles import document, figures, levels, run
 from sme_registry.profiles.document import REFERENCES, ProfileRow
 from sme_registry.profiles.levels import AXES, DEFAULT, TWO_LAYERS
 from sme_registry.profiles.page import write_page
@@ -127,7 +128,7 @@ class TestFacts:
     def test_it_is_unknown_where_nothing_was_learnt_or_a_level_is_missing(self):
         unlearnt = made(lambda level, i: 0.95)
         assert math.isnan(unlearnt.robustness(AXIS["k"]).value)
-        assert "learnt too little" in unlearnt.sentences([])[0]
+        assert "hardly better than the constant" in unlearnt.sentences([])[0]
         partial = made(lambda level, i: None if level == "k-25" else 0.1)
         assert math.isnan(partial.robustness(AXIS["k"]).value)
         assert not math.isnan(partial.robustness(AXIS["D"]).value)
@@ -155,6 +156,61 @@ class TestFacts:
         text = better.sentences([theirs])[-1]
         assert text.startswith("Against PPO")
         assert "better on" in text
+
+    def test_an_indication_says_on_which_side_it_is(self):
+        theirs = made(lambda level, i: 0.5 + 0.05 * i, name="PPO", draws=2)
+        mixed = made(lambda level, i: (0.3 if "k-" in level else 0.7) + 0.05 * i, draws=2)
+        text = mixed.sentences([theirs])[-1]
+        assert "as an indication only, worse on " in text
+        assert "as an indication only, better on reward interval k (−0.20" in text
+
+    def test_where_it_breaks_most_says_which_intervals_overlap(self):
+        regrets = {"k-25": 0.6, "k-5": 0.6, "D-0_5": 0.58, "D-0_25": 0.58}
+        spread = made(lambda level, i: regrets.get(level, 0.2) + 0.03 * (i - 2))
+        text = spread.sentences([])[0]
+        assert "breaks most along reward interval k" in text
+        assert "The intervals along survival threshold D (0.53 [0.49" in text
+        exact = made(lambda level, i: regrets.get(level, 0.2))
+        assert "overlap" not in exact.sentences([])[0]
+
+    def test_missing_levels_are_not_called_a_bad_performance(self):
+        text, *_ = made(lambda level, i: 0.1 if level == DEFAULT else None).sentences([])
+        assert "hardly better" not in text
+        assert "no axis has runs" in text
+
+    def test_steps_to_half_count_the_draws_that_did_not_reach_it(self):
+        half = made(lambda level, i: 0.1 + 0.6 * i, draws=2)
+        assert "in 1 of 2 draws it never fell to ½" in half.sentences([])[1]
+
+    def test_a_reference_that_does_not_learn_has_no_training(self):
+        linear = Profile.references()["linear"]
+        assert linear.steps_to_half() is None
+        assert linear.sentences([])[1].endswith("; it does not learn.")
+        assert "no training, 95 of 95 runs" in str(linear)
+
+    def test_others_have_the_robustness_of_a_quick_profiles_levels(self, tmp_path):
+        quick = made(lambda level, i: 0.2).model_copy(update={"classes": run.quick_classes()})
+        theirs = made(lambda level, i: {"k-5": 0.3, "k-25": 0.6}.get(level, 0.2), name="PPO")
+        axis = AXIS["k"]
+        assert theirs.robustness(axis).value == pytest.approx((0.7 / 0.8 + 0.4 / 0.8) / 2)
+        assert theirs.robustness(axis, quick.classes).value == pytest.approx(0.4 / 0.8)
+        write_page(quick, tmp_path, [theirs])
+        page = (tmp_path / "profile.html").read_text()
+        assert "details::details-content { content-visibility: visible" in page  # when printed
+        row = re.search(r">reward interval k<.*?</tr>", page, re.S)
+        assert "1.00" in row[0]
+        assert "0.50" in row[0]
+
+    def test_what_is_outside_a_figure_is_marked_at_its_edge(self):
+        low = made(lambda level, i: 0.2 if level in (DEFAULT, TWO_LAYERS) else 2.5 + 0.01 * i)
+        for figure in (low.draw([]), figures.draw_robustness(low, [])):
+            for axes in figure.axes:
+                (left, right), (bottom, top) = axes.get_xlim(), sorted(axes.get_ylim())
+                for line in axes.lines:
+                    x, y = np.array(line.get_xdata(), float), np.array(line.get_ydata(), float)
+                    if line.get_marker() not in ("", "None"):
+                        assert ((left <= x) & (x <= right)).all()
+                        assert ((bottom <= y) & (y <= top)).all()
 
     def test_other_steps_and_the_algorithm_itself_are_not_compared(self):
         ppo, linear = (Profile.references()[name] for name in ("PPO", "linear"))
