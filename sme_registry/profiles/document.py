@@ -24,7 +24,7 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 
 from sme_registry.io.markup import Table, card, conjunction, fixed, plural, signed, table_html
-from sme_registry.profiles.levels import AXES, DEFAULT, Axis, plan_file
+from sme_registry.profiles.levels import AXES, COMPARED, DEFAULT, Axis, plan_file
 from sme_registry.spec import StudyAlgorithm
 from sme_registry.spec.document import Digest, Integer, Real, StoredModel, StrictModel, TupleOf
 from sme_registry.spec.study import PlannedCell
@@ -40,7 +40,6 @@ UNLEARNT = THRESHOLDS["unlearnt"]
 DIGITS = 6
 _HALF = 0.5
 _NAMED = 3  # axes, in one sentence
-COMPARED = "PPO", "TD3", "SAC"  # in sentences; others are in figures and tables
 
 
 class ProfileRow(StrictModel):

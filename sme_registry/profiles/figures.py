@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sme_registry.plots.style import GREY, draw_band, literal, new_figure, styled
-from sme_registry.profiles.document import COMPARED, Profile
-from sme_registry.profiles.levels import AXES, Axis
+from sme_registry.profiles.levels import AXES, COMPARED, Axis
 from sme_registry.studies.report.figures.panels import (
     LINEAR,
     WIDTH,
@@ -24,6 +23,8 @@ from sme_registry.studies.report.figures.panels import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from sme_registry.profiles.document import Profile
 
 _HIGHEST = 1.45  # N₀ that the figure shows
 _LEAST, _MOST = -0.6, 1.35  # robustness
@@ -71,9 +72,9 @@ def _draw_line(axes: Axes, profile: Profile, axis: Axis, look: Look, *, front: b
     if front or look["marker"]:
         draw_band(axes, x, low, high, look["color"])
     width, alpha, order = (2.2, 1.0, 3) if front else (1.1, 0.75, 2)
-    y = np.minimum(y, _HIGHEST)  # of more, the mark is at the edge
     style = {**look, "linewidth": width, "alpha": alpha, "markersize": 4, "zorder": order}
-    axes.plot(x, y, **style, clip_on=False)
+    heights = np.minimum(y, _HIGHEST)  # of more, the mark is at the edge
+    axes.plot(x, heights, **style, clip_on=False)
 
 
 @styled()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from sme_registry.spec import StudyFile, catalogue
 
 PLAN = "profile"
+COMPARED = "PPO", "TD3", "SAC"  # in sentences; other references are in figures and tables
 DEFAULT, TWO_LAYERS = "default", "complexity-2"
 
 
