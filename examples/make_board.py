@@ -34,7 +34,7 @@ import sme_registry
 from leaderboard.admission import submit_bundle, submit_references
 from leaderboard.bundle import make_bundle
 from leaderboard.documents.signed import Receiver, SigningKey
-from leaderboard.documents.submission import Training
+from leaderboard.documents.submission import Description, Training
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store
@@ -149,12 +149,11 @@ def make_board(
             source = runs[method] if runs else train_all(Path(temporary, method), suite, method)
             make_bundle(
                 Path(temporary, f"bundle-{index}"),
+                Description(method, submitter),
                 suite=suite,
                 key=key,
                 receiver=Receiver(store.document.key),
                 runs=[source],
-                method=method,
-                submitter=submitter,
                 training=None if runs else Training(library=f"numpy {np.__version__}"),
             )
             submit_bundle(store, Path(temporary, f"bundle-{index}"))

@@ -29,12 +29,11 @@ from leaderboard.documents.submission import (
     FILE,
     MAX_ARTEFACT_BYTES,
     Artefact,
-    Knowledge,
+    Description,
     Submission,
     Training,
     check_names,
     check_runs,
-    manifest_fields,
 )
 from leaderboard.errors import Rejection
 from leaderboard.gate.sandbox import inspect_own, widths
@@ -130,17 +129,11 @@ def _read(folder: Path, name: str, limit: int) -> bytes | None:
 
 def make_bundle(
     folder: str | os.PathLike[str],
+    description: Description,
     *,
     suite: SuiteFile,
     key: SigningKey,
     runs: Iterable[str | os.PathLike[str]],
-    method: str,
-    submitter: str,
-    version: str = "1",
-    family: str | None = None,
-    knowledge: Knowledge = "generic",
-    code: str | None = None,
-    statement: str = "",
     runs_started: dict[str, int] | None = None,
     training: Training | None = None,
     algorithm: str | None = None,
@@ -166,9 +159,7 @@ def make_bundle(
         for member in suite.suite.classes
     }
     fields = {
-        **manifest_fields(
-            key.public, method, version, family, knowledge, submitter, code, statement
-        ),
+        **description.fields(key.public),
         "suite": {"name": suite.versioned_name, "digest": suite.digest},
         "runs_started": of_class | (runs_started or {}),
         "training": _training_facts(listed) if training is None else training,

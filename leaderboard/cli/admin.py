@@ -19,6 +19,7 @@ from leaderboard.cli.results import WITH_SEASONS, Board, BoardFolder, Json, is_u
 from leaderboard.cli.submit import DEFAULT_KEY, KeyFile, SuiteName, find_suite, own_key
 from leaderboard.documents.board import RUNS_TO_RANK, Folder
 from leaderboard.documents.signed import Receiver, SigningKey
+from leaderboard.documents.submission import Description
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import Isolation, available_isolation, isolation_for_own
 from leaderboard.scoring.worker import Work, run_scorers
@@ -471,15 +472,11 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
         admission.submit_references(store)
         make_bundle(
             folder / "bundle",
+            Description(record.algorithm, _TITLE, version="demo"),
             suite=file,
             receiver=Receiver(store.document.key),
             key=SigningKey.generate(),
             runs=[run],
-            method=record.algorithm,
-            version="demo",
-            family=record.algorithm,
-            knowledge="generic",
-            submitter="Demonstration",
         )
         admission.submit_bundle(store, folder / "bundle")
 

@@ -20,7 +20,7 @@ from leaderboard.documents.board import FILE as BOARD
 from leaderboard.documents.board import BoardDocument, Folder, refuse_unscored
 from leaderboard.documents.result import RANKED, Result
 from leaderboard.documents.signed import Receiver, SigningKey
-from leaderboard.documents.submission import FILE, Knowledge, Withdrawal, now
+from leaderboard.documents.submission import FILE, Description, Knowledge, Withdrawal, now
 from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import isolation_for_own
 from leaderboard.scoring.score import score_submission
@@ -210,20 +210,17 @@ def submit(
             if not (method and submitter):
                 raise OptionError("--method, --submitter: both are required to submit runs.")
             signing_key = own_key(key)
+            description = Description(
+                method, submitter, method_version, family, knowledge, code, statement
+            )
             total = len(folders)
             with Progress("exporting", total, console=err(), unit="runs") as progress:
                 bundle = make_bundle(
                     out_folder or Path(temporary, "bundle"),
+                    description,
                     suite=document.suite_file,
                     key=signing_key,
                     runs=folders,
-                    method=method,
-                    version=method_version,
-                    family=family,
-                    knowledge=knowledge,
-                    submitter=submitter,
-                    code=code,
-                    statement=statement,
                     runs_started=_runs_started(started or []),
                     algorithm=algorithm,
                     receiver=receiver_of(board),

@@ -83,15 +83,8 @@ class SigningKey:
         _require_nacl()
         from nacl import signing
 
-        try:
-            return cls(signing.SigningKey(parse_secret(read_regular(path, 4096, links=links))))
-        except OSError as error:
-            reason = error.strerror
-        except ValueError:
-            reason = "not 64 hex digits"
-        raise BoardError(
-            f"{path}: no signing key: {reason}. Restore it; `sme-leaderboard submit` creates one."
-        )
+        remedy = "Restore it; `sme-leaderboard submit` creates one."
+        return cls(signing.SigningKey(read_secret(path, "signing key", remedy, links=links)))
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the key into a new file that only its owner can read."""
@@ -177,9 +170,20 @@ def write_secret(path: str | os.PathLike[str], secret: bytes) -> Path:
     return path
 
 
-def parse_secret(data: bytes) -> bytes:
-    """The bytes in the contents of such a file; `ValueError` if they are not hex digits."""
-    return bytes.fromhex(data.decode("ascii").strip())
+def read_secret(
+    path: str | os.PathLike[str], what: str, remedy: str, *, links: bool = False
+) -> bytes:
+    """The 32 bytes in such a file; `BoardError` if it has none, or is a link without `links`."""
+    try:
+        secret = bytes.fromhex(read_regular(path, 4096, links=links).decode("ascii").strip())
+        reason = "" if len(secret) == 32 else f"{len(secret)} bytes, not 32"
+    except OSError as error:
+        reason = str(error.strerror)
+    except ValueError:
+        reason = "not 64 hex digits"
+    if reason:
+        raise BoardError(f"{path}: no {what}: {reason}. {remedy}")
+    return secret
 
 
 def plain_json(value: Any) -> bytes:

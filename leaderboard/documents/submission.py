@@ -17,7 +17,7 @@ import time
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
@@ -248,25 +248,27 @@ def now() -> str:
     return utc(datetime.datetime.fromtimestamp(time.time(), datetime.UTC))
 
 
-def manifest_fields(
-    key: str,
-    method: str,
-    version: str,
-    family: str | None,
-    knowledge: str,
-    submitter: str,
-    code: str | None,
-    statement: str,
-) -> dict[str, Any]:
-    """The fields of a `Manifest`, signed now."""
-    kind = {"family": family or method, "knowledge": knowledge}
-    return {
-        "method": {"name": method, "version": version, **kind},
-        "code": code,
-        "submitter": {"name": submitter, "key": key},
-        "created": now(),
-        "statement": statement,
-    }
+class Description(NamedTuple):
+    """What an entrant says of a method, on every track; validated as part of a `Manifest`."""
+
+    method: str
+    submitter: str
+    version: str = "1"
+    family: str | None = None  # by default the method
+    knowledge: str = "generic"
+    code: str | None = None
+    statement: str = ""
+
+    def fields(self, key: str) -> dict[str, Any]:
+        """Those of a manifest that a public key signs now."""
+        kind = {"family": self.family or self.method, "knowledge": self.knowledge}
+        return {
+            "method": {"name": self.method, "version": self.version, **kind},
+            "code": self.code,
+            "submitter": {"name": self.submitter, "key": key},
+            "created": now(),
+            "statement": self.statement,
+        }
 
 
 def check_names(manifest: Manifest, board_key: str | None = None) -> None:

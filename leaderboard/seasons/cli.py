@@ -101,7 +101,7 @@ def new(
     # First: a season whose master is lost cannot be revealed, and the reverse does no harm.
     master = Master.generate()
     master.write(path)
-    count = len(list(fields.hidden)) if fields.track == "sealed-offline" else 0
+    count = fields.count if fields.track == "sealed-offline" else 0
     with Progress("generating", count, console=err(), unit="instances") as progress:
         try:
             season = create_season(fields, master, folder, progress.update)
@@ -184,7 +184,7 @@ def close(board: BoardFolder, season: SeasonId) -> None:
             f"What counts in {row.id}",
             {"number": "number", "method": "text", "submitter": "text", "received": "name"},
         )
-        for each in counting(store, store.season(season)):
+        for each in counting(store, row.terms):
             names = f"{each.method} {each.version}", each.submitter
             table.add_row(str(each.number), *map(escape, names), each.received)
         head = store.head
@@ -210,7 +210,7 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
         count = len(store.entrants(row.digest))
         with Progress("scoring", count, console=err(), unit="entries") as progress:
             scored = score_entries(store, row.digest, progress.update)
-    out().print(f"{row.id}: revealed, {plural(scored, *_UNITS[row.kind])} scored.")
+    out().print(f"{row.id}: revealed, {plural(scored, *_UNITS[row.terms.track])} scored.")
 
 
 @season.command()
@@ -248,15 +248,17 @@ def show(
                 table.add_row(*(escape(str(facts[name])) for name in columns), str(count))
             out().print(table)
             return
-        row, document = store.season_row(season), store.season(season)
-        facts, keys = _facts(store, row), by_key(store, document)
-        rankings = season_rankings(store, document, metric)
-        plain = ranking_facts(store, document, metric)
+        row = store.season_row(season)
+        facts, keys = _facts(store, row), by_key(store, row.terms)
+        rankings = season_rankings(store, row.terms, metric)
+        plain = ranking_facts(store, row.terms, metric)
     if json:
         print_json({**facts, "metric": metric, "ranking": plain})
         return
-    print_pairs(escape(row.title), {name: fact for name, fact in facts.items() if fact is not None})
-    _, units = _UNITS[row.kind]
+    print_pairs(
+        escape(row.terms.title), {name: fact for name, fact in facts.items() if fact is not None}
+    )
+    _, units = _UNITS[row.terms.track]
     of_key: dict[str, Callable[[RankedRow], str]] = {
         "methods": lambda row: str(keys[row.entry.key].methods),
         units: lambda row: str(keys[row.entry.key].entries),
@@ -291,20 +293,20 @@ def _warn_of_easy_classes(plan: Season) -> None:
 
 def _facts(store: SeasonStore, row: SeasonRow) -> dict[str, Any]:
     """A season in short."""
-    document, entrants = store.season(row.digest), store.entrants(row.digest)
+    terms, entrants = row.terms, store.entrants(row.digest)
     return {
-        "id": row.id,
+        "id": terms.id,
         "digest": row.digest,
-        "track": row.kind,
+        "track": terms.track,
         "state": row.state(store.clock.time),
-        "opens": row.opens,
-        "closes": row.closes,
-        "instances": row.instances,
+        "opens": terms.opens,
+        "closes": terms.closes,
+        "instances": terms.count,
         "keys": len({each.key for each in entrants}),
-        _UNITS[row.kind][1]: len(entrants),
-        "admission": document.admission,
-        "admitted": None if document.admission == "open" else len(store.admitted(row.digest)),
-        "commitment": document.commitment,
+        _UNITS[terms.track][1]: len(entrants),
+        "admission": terms.admission,
+        "admitted": None if terms.admission == "open" else len(store.admitted(row.digest)),
+        "commitment": terms.commitment,
         "revealed": row.revealed or None,
     }
 

@@ -28,7 +28,7 @@ from leaderboard.cli.submit import (
     receiver_of,
 )
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
-from leaderboard.documents.submission import manifest_fields
+from leaderboard.documents.submission import Description
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.publication import read_season
 from leaderboard.seasons.scoring import enter as enter_folder
@@ -106,6 +106,7 @@ def ticket(
     """
 
     check_new(out_file)
+    description = Description(method, submitter, method_version, family, knowledge, code, statement)
     signing_key = own_key(key)
     # Kept until the ticket is: a request that was sent and not answered may have started one.
     request_file = out_file.with_name(f"{out_file.name}.request")
@@ -119,10 +120,7 @@ def ticket(
         nonce = secrets.token_hex(32)
         request = TicketRequest.from_dict(
             {
-                **manifest_fields(
-                    *(signing_key.public, method, method_version, family, knowledge),
-                    *(submitter, code, statement),
-                ),
+                **description.fields(signing_key.public),
                 "season": season_digest,
                 "nonce": nonce,
                 "answers_key": signing_key.of_answers(nonce).public,
@@ -307,6 +305,7 @@ def enter(
       sme-leaderboard enter board autumn '{name}.npy' --method X --submitter Y --failed deep-3
     """
 
+    description = Description(method, submitter, method_version, family, knowledge, code, statement)
     season, signing_key = read_season(published), own_key(key)
     hidden = {each.name: each.member.setting for each in season.hidden}
     without = failed or []
@@ -329,10 +328,7 @@ def enter(
     answers = {sha256_of(data): data for data in files.values()}
     entry = Entry.from_dict(
         {
-            **manifest_fields(
-                *(signing_key.public, method, method_version, family, knowledge),
-                *(submitter, code, statement),
-            ),
+            **description.fields(signing_key.public),
             "season": season.digest,
             "answers": [named.get(name) for name in hidden],
         }

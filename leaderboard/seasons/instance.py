@@ -104,7 +104,10 @@ class SignedFile(Generic[_Kind]):
 
 
 class Instance:
-    """One hidden instance of a ticket, for any number of threads."""
+    """One hidden instance of a ticket, for any number of threads.
+
+    What the disk does not take raises OSError, and has changed nothing.
+    """
 
     def __init__(self, ticket: Ticket, number: int, member: SeasonClass) -> None:
         self._ticket, self._number, self._setting = ticket, number, member.setting
@@ -172,8 +175,7 @@ class Instance:
         """The answers `[regions · n, A]` and the digest of their file."""
         if not self.answered:
             return None, None
-        with storage():
-            data = read_regular(self._answers_path, self.answer_bytes)
+        data = read_regular(self._answers_path, self.answer_bytes)
         return read_answers(data, self._setting, self._ticket.season.protocol), io.sha256_of(data)
 
     @property
@@ -209,9 +211,7 @@ class Instance:
                     raise Rejection(
                         "lanes_invalid", f"lanes={lanes}: must be in [1, {most}]. Correct it."
                     )
-                with storage():
-                    action_dim = self._setting.action_dim
-                    journal = Journal.create(self._journal_path, lanes, action_dim)
+                journal = Journal.create(self._journal_path, lanes, self._setting.action_dim)
                 self._journal = journal
             if lanes != journal.lanes:
                 message = f"lanes={lanes}: the instance was started with {journal.lanes}."
@@ -233,8 +233,7 @@ class Instance:
             self._check_next(journal, number)
             if _is_due(play):
                 self._sign(play, signature)
-            with storage():
-                journal.append(body[8:])
+            journal.append(body[8:])
             # Whatever raises between here and the end, such as a lack of memory: the step is taken.
             self._play = None
             answer = play.take(body)
@@ -247,22 +246,20 @@ class Instance:
             journal = self._started()
             if not journal.ended:
                 self._sign(self._playing(), signature)
-                with storage():
-                    journal.end()
+                journal.end()
             self.release()
 
     def challenge(self) -> bytes:
         with self._lock:
             if not self._started().ended:
                 raise _wrong_phase(self.status.phase, "Finish it before the challenge.")
-            with storage():
-                if not self._challenge_path.exists():
-                    write_whole(self._challenge_path, self._ticket.hidden(self._number).challenge)
-                return read_regular(self._challenge_path, 2**28)
+            if not self._challenge_path.exists():
+                write_whole(self._challenge_path, self._ticket.hidden(self._number).challenge)
+            return read_regular(self._challenge_path, 2**28)
 
     def answer(self, data: bytes, signature: str) -> bool:
         """Store the answers to the challenge, an .npy file; False if the same ones are stored."""
-        with self._lock, storage():
+        with self._lock:
             if self.answered and read_regular(self._answers_path, len(data) + 1) == data:
                 io.sync_folder(self._answers_path.parent)  # which may have failed the first time
                 return False
@@ -377,10 +374,9 @@ class Instance:
     def _sign(self, play: Play, signature: str) -> None:
         """Store the entrant's signature of all steps so far."""
         signed = self._signed(play.requests, play.head, signature)
-        with storage():
-            self.sync()
-            write_whole(self._signature.path, signed)
-            write_whole(self._snapshot_path, play.snapshot())
+        self.sync()
+        write_whole(self._signature.path, signed)
+        write_whole(self._snapshot_path, play.snapshot())
 
     def _signed(self, number: int, head: bytes, signature: str) -> bytes:
         """The file with the entrant's signature of so many requests, whose hash is the head."""

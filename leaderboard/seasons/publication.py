@@ -170,7 +170,7 @@ def files_of_seasons(store: Store) -> Iterator[Files]:
     assert isinstance(store, SeasonStore)
     for row in store.seasons():
         folder = store.season_folder(row.digest)
-        check = partial(check_published, store.season(row.digest), folder / "published")
+        check = partial(check_published, row.terms, folder / "published")
         yield Files(f"/api/seasons/{row.id}/files", folder, check)
 
 
@@ -268,7 +268,7 @@ class _SeasonVerifier:
     folders: Mapping[str, Path]
 
     def __post_init__(self) -> None:
-        self.season: Season = self.store.season(self.of.digest)
+        self.season = self.of.terms
         self.entrants = self.store.entrants(self.of.digest)
         self.is_online = self.season.track == "sealed-online"
 
@@ -279,7 +279,7 @@ class _SeasonVerifier:
                 self.refuse_early(row, "without all answers")
         self.report("signatures of entrants", len(self.entrants))
         for result in filter(None, map(self.store.sealed_result, self.entrants)):
-            refuse_contradiction(self.contradiction(result), f"{self.of.id}, {result.subject}")
+            refuse_contradiction(self.contradiction(result), f"{self.season.id}, {result.subject}")
         if self.of.reveal is None:
             self.check_published()
             count = len(self.entrants)
@@ -290,7 +290,7 @@ class _SeasonVerifier:
         self.score_again(master)
 
     def report(self, what: str, checked: int, unchecked: int = 0, why: str = "") -> None:
-        self.findings.report(f"{self.of.id}: {what}", checked, unchecked, why)
+        self.findings.report(f"{self.season.id}: {what}", checked, unchecked, why)
 
     def check_signature(self, row: SealedRow) -> None:
         """Check an entrant's signature, which the board's own key cannot forge."""
@@ -353,7 +353,7 @@ class _SeasonVerifier:
             follows = data.agrees_with(published)
         if not follows:
             raise TamperedError(
-                f"{self.of.id}: published {expected.class_name} {expected.instance}",
+                f"{self.season.id}: published {expected.class_name} {expected.instance}",
                 "its data set or challenge states do not follow from the master",
             )
         return "within rounding"
@@ -368,12 +368,12 @@ class _SeasonVerifier:
         left = sum(row.result is None for row in counted)
         self.findings.compare(
             (
-                (f"{self.of.id}, {row.id}", self.store.sealed_result(row), here)
+                (f"{self.season.id}, {row.id}", self.store.sealed_result(row), here)
                 for row, here in zip(whole, self.scored(master, whole), strict=True)
             ),
             (left, "not scored yet: repeat `sme-leaderboard season reveal`"),
             (len(scored) - len(whole), "their answers are not here"),
-            of=f"{self.of.id}: ",
+            of=f"{self.season.id}: ",
         )
 
     def has_answers(self, row: SealedRow) -> bool:
@@ -410,4 +410,4 @@ class _SeasonVerifier:
 
     def refuse(self, row: SealedRow, message: str) -> NoReturn:
         kind = "ticket" if self.is_online else "entry"
-        raise TamperedError(f"{self.of.id}: {kind} {row.number} ({row.id})", message)
+        raise TamperedError(f"{self.season.id}: {kind} {row.number} ({row.id})", message)

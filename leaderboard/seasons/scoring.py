@@ -339,8 +339,7 @@ def enter(
         return False
     entry, key = signed.content, signed.content.submitter.key
     check_manifest(store.document, entry, datetime.datetime.fromisoformat(store.time))
-    store.open_season(entry.season, "sealed-offline", key, store.time)
-    season = store.season(entry.season)
+    season = store.open_season(entry.season, "sealed-offline", key, store.time).terms
     given = _check_answers(store, season, signed, answers)
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
         check_entrant(store, entry.submitter, len(signed.to_bytes()))

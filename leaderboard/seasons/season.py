@@ -41,14 +41,14 @@ from leaderboard.documents.result import ClassScore, RunScore, Scores
 from leaderboard.documents.signed import (
     PublicKey,
     Signable,
-    parse_secret,
     plain_json,
+    read_secret,
     write_secret,
 )
 from leaderboard.documents.submission import Artefact, Manifest, Method, SafeName, UtcTime
-from leaderboard.errors import BoardError, Rejection
+from leaderboard.errors import Rejection
 from sme_registry.errors import ActionError, WireError
-from sme_registry.io import read_regular, sha256_of
+from sme_registry.io import sha256_of
 from sme_registry.seasons.transcript import Count, Head, TicketHeads
 from sme_registry.seasons.wire import (
     MAX_INSTANCES,
@@ -182,7 +182,7 @@ class Season(Document):
         names = [member.name for member in self.classes]
         if len(set(names)) < len(names):
             raise ValueError(f"classes={names}: must have different names. Rename one.")
-        count = sum(member.instances for member in self.classes)
+        count = self.count
         most = MAX_INSTANCES if self.track == "sealed-online" else MAX_OFFLINE_INSTANCES
         if count > most:
             raise ValueError(
@@ -234,6 +234,11 @@ class Season(Document):
     @field_serializer("ticket_hours")
     def _as_in_earlier_files(self, hours: float | None) -> int | float | None:
         return int(hours) if hours is not None and hours.is_integer() else hours
+
+    @property
+    def count(self) -> int:
+        """The number of hidden instances, of each ticket or of all entries."""
+        return sum(member.instances for member in self.classes)
 
     @property
     def hidden(self) -> Iterator[Hidden[SeasonClass]]:
@@ -426,19 +431,10 @@ class Master:
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Master:
         """Read a master from a file."""
-        try:
-            raw = parse_secret(read_regular(Path(path), 4096))
-            reason = "" if len(raw) == _BYTES else f"{len(raw)} bytes, not {_BYTES}"
-        except OSError as error:
-            reason = str(error.strerror)
-        except ValueError:
-            reason = "not 64 hex digits"
-        if reason:
-            raise BoardError(
-                f"{path}: no master secret: {reason}. `sme-leaderboard season new` creates one; "
-                "without it nobody can reveal the season."
-            )
-        return cls(raw)
+        remedy = (
+            "`sme-leaderboard season new` creates one; without it nobody can reveal the season."
+        )
+        return cls(read_secret(path, "master secret", remedy))
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the master into a new file that only its owner can read."""

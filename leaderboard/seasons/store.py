@@ -34,25 +34,25 @@ _Signed = TypeVar("_Signed", bound=Signed[SealedManifest])
 
 
 class SeasonRow(NamedTuple):
-    """One season, as pages need it."""
+    """One season of a board: its terms, and what the log has of it."""
 
-    digest: str  # of season.json's content
+    terms: Season
+    digest: str  # of the terms
     sequence: int
     announced: str  # time of the log entry
-    document: str  # SHA-256 of season.json
-    id: str
-    title: str
-    kind: SealedTrack
-    opens: str
-    closes: str
-    instances: int  # number of hidden ones, of each ticket or of all entries
     reveal: str | None  # SHA-256 of reveal.json; None until the reveal
     revealed: str  # when; empty likewise
+
+    @property
+    def id(self) -> str:
+        return self.terms.id
 
     def state(self, time: str) -> str:
         if self.reveal is not None:
             return "revealed"
-        return "announced" if time < self.opens else "open" if time < self.closes else "closed"
+        if time < self.terms.opens:
+            return "announced"
+        return "open" if time < self.terms.closes else "closed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,16 +90,18 @@ class SeasonStore(Store):
             "revealed": self._revealed,
         }
 
-    def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
-        with self.reading() as index:
-            return index.connection.execute(statement, values).fetchall()
-
     def seasons(self) -> list[SeasonRow]:
-        return [SeasonRow(*row) for row in self._all(f"{_SEASONS} ORDER BY sequence")]
+        return self._rows("ORDER BY sequence")
 
     def _find(self, name: str) -> SeasonRow | None:
-        rows = self._all(f"{_SEASONS} WHERE digest = ?1 OR id = ?1", name)
-        return SeasonRow(*rows[0]) if rows else None
+        return next(iter(self._rows("WHERE digest = ?1 OR id = ?1", name)), None)
+
+    def _rows(self, which: str, *values: str) -> list[SeasonRow]:
+        columns = "document, digest, sequence, announced, reveal, revealed"
+        return [
+            SeasonRow(self.objects.document(Season, document), *facts)
+            for document, *facts in self.query(f"SELECT {columns} FROM track {which}", *values)
+        ]
 
     def season_row(self, name: str) -> SeasonRow:
         row = self._find(name)
@@ -113,16 +115,16 @@ class SeasonStore(Store):
 
     def season_of_track(self, name: str, track: SealedTrack) -> SeasonRow:
         row = self.season_row(name)
-        if row.kind != track:
+        if row.terms.track != track:
             raise Rejection(
                 "season_track",
-                f"season={row.id}: its track is {row.kind}: must be {track}. Offline seasons take "
-                "entries, online ones start tickets.",
+                f"season={row.id}: its track is {row.terms.track}: must be {track}. Offline "
+                "seasons take entries, online ones start tickets.",
             )
         return row
 
     def season(self, name: str) -> Season:
-        return self.objects.document(Season, self.season_row(name).document)
+        return self.season_row(name).terms
 
     def season_folder(self, digest: str) -> Path:
         """`published` has data sets and challenge states, `tickets` what was played."""
@@ -130,7 +132,7 @@ class SeasonStore(Store):
 
     def admitted(self, season: str) -> dict[str, str]:
         """The names of the admitted keys of a season, by its digest."""
-        return dict(self._all("SELECT key, name FROM admitted WHERE track = ?", season))
+        return dict(self.query("SELECT key, name FROM admitted WHERE track = ?", season))
 
     def entrants(self, season: str) -> list[SealedRow]:
         return self._sealed("track = ?", season)
@@ -153,7 +155,7 @@ class SeasonStore(Store):
             return list(index.entrants(SealedRow, where, *values))
 
     def _next_number(self, season: str) -> int:
-        [(number,)] = self._all("SELECT count(*) + 1 FROM entry WHERE track = ?", season)
+        [(number,)] = self.query("SELECT count(*) + 1 FROM entry WHERE track = ?", season)
         return int(number)
 
     def ticket_folder(self, season: str, number: int) -> Path:
@@ -232,7 +234,7 @@ class SeasonStore(Store):
                 )
             if row.result is not None:
                 return False
-            online = self.season_row(row.track).kind == "sealed-online"
+            online = self.season(row.track).track == "sealed-online"
             self.record("ended" if online else "ranked", result.subject, result)
         return True
 
@@ -255,10 +257,8 @@ class SeasonStore(Store):
             "sequence": entry.sequence,
             "announced": entry.time,
             "document": entry.document,
-            "kind": season.track,
-            "instances": sum(1 for _ in season.hidden),
+            "id": season.id,
         }
-        values |= {name: getattr(season, name) for name in ("id", "title", "opens", "closes")}
         self._connected.insert("track", values)
 
     def _admitted(self, entry: LogEntry) -> None:
@@ -277,11 +277,12 @@ class SeasonStore(Store):
     def _entered(self, entry: LogEntry) -> None:
         season, signed = self._signed(entry, "sealed-offline", Signed[Entry])
         answers = signed.content.answers
-        if len(answers) != season.instances:
+        count = season.terms.count
+        if len(answers) != count:
             raise Rejection(
                 "answer_missing",
-                f"answers: has {len(answers)}: must have {season.instances}, one for each instance "
-                f"of the season {season.id}, null where the method failed.",
+                f"answers: has {len(answers)}: must have {count}, one for each instance of the "
+                f"season {season.terms.id}, null where the method failed.",
             )
         given = [answer for answer in answers if answer is not None]
         self._add(entry, season, signed.content, len(given), 0)
@@ -290,9 +291,8 @@ class SeasonStore(Store):
 
     def _started(self, entry: LogEntry) -> None:
         row, signed = self._signed(entry, "sealed-online", Signed[TicketRequest])
-        season = self.season(row.digest)
-        self._check_limits(season, signed.content.submitter.key)
-        self._add(entry, row, signed.content, row.instances, played_bytes(season))
+        self._check_limits(row.terms, signed.content.submitter.key)
+        self._add(entry, row, signed.content, row.terms.count, played_bytes(row.terms))
 
     def _signed(
         self, entry: LogEntry, track: SealedTrack, kind: type[_Signed]
@@ -307,14 +307,15 @@ class SeasonStore(Store):
         row = self.season_of_track(name, track)
         if row.reveal is not None:
             raise _is_revealed(row)
-        if time < row.opens:
+        terms = row.terms
+        if time < terms.opens:
             raise Rejection(
                 "season_not_open",
-                f"season={row.id}: opens at {row.opens}, and it is {time}. Come back then.",
+                f"season={row.id}: opens at {terms.opens}, and it is {time}. Come back then.",
             )
-        if time >= row.closes:
-            raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
-        if self.season(row.digest).admission == "listed" and key not in self.admitted(row.digest):
+        if time >= terms.closes:
+            raise Rejection("season_closed", f"season={row.id}: closed at {terms.closes}.")
+        if terms.admission == "listed" and key not in self.admitted(row.digest):
             raise Rejection(
                 "not_admitted",
                 f"key={key[:16]}…: the organiser of the season {row.id} has not admitted it. Send "
@@ -325,9 +326,8 @@ class SeasonStore(Store):
     def _check_limits(self, season: Season, key: str) -> None:
         assert season.tickets is not None  # the track is online
         assert season.tickets_per_key is not None
-        own = self._connected.number(
-            "SELECT count(*) FROM entry WHERE track = ? AND key = ?", season.digest, key
-        )
+        mine = "SELECT count(*) FROM entry WHERE track = ? AND key = ?"
+        [(own,)] = self.query(mine, season.digest, key)
         if own >= season.tickets_per_key:
             raise Rejection(
                 "ticket_limit",
@@ -352,7 +352,7 @@ class SeasonStore(Store):
             number=self._next_number(row.digest),
             created=manifest.created,
             submitter=self.admitted(row.digest).get(key, name),
-            runs=row.instances,
+            runs=row.terms.count,
             policies=policies,
             reserved=played,
         )
@@ -362,13 +362,13 @@ class SeasonStore(Store):
         if row is None or row.result is not None:
             raise entry.contradiction("the entry or ticket is unknown, or has a result")
         season = self.season_row(row.track)
-        online = season.kind == "sealed-online"
+        online, count = season.terms.track == "sealed-online", season.terms.count
         if online != (entry.event == "ended") or not (online or season.reveal):
             raise entry.contradiction("of another track, or before the reveal")
         result = self._connected.read(SealedResult, entry)
         entry.check_subject(result.subject)
         sizes = len(result.runs), len(result.stepping)
-        if result.season != row.track or sizes != (season.instances, season.instances * online):
+        if result.season != row.track or sizes != (count, count * online):
             raise entry.contradiction("names a result of another season")
         self._connected.connection.execute(
             "UPDATE entry SET status = 'scored', result = ?, finished = ?, policies = ?, "
@@ -378,7 +378,7 @@ class SeasonStore(Store):
                 sum(run.artefact is not None for run in result.runs),
                 sum(each.steps for each in result.stepping),
                 *(result.oracle_like, result.scores.to_text()),
-                played_bytes(self.season(season.digest), result) if online else 0,
+                played_bytes(season.terms, result) if online else 0,
                 entry.subject,
             ),
         )
@@ -390,7 +390,7 @@ class SeasonStore(Store):
         reveal = self._connected.read(Reveal, entry)
         entry.check_subject(reveal.season)
         master = Master(bytes.fromhex(reveal.master))
-        if not self.season(row.digest).is_committed_to(master):
+        if not row.terms.is_committed_to(master):
             raise Rejection(
                 "reveal_mismatch",
                 f"master: does not match the commitment of the season {row.id}. Give the file "
@@ -399,7 +399,7 @@ class SeasonStore(Store):
         if row.reveal is not None:
             raise entry.contradiction("the season is already revealed")
         for other in self.seasons():  # whose tasks may follow from the same secret
-            if other.reveal is None and self.season(other.digest).is_committed_to(master):
+            if other.reveal is None and other.terms.is_committed_to(master):
                 self._check_over(other, entry.time)
         self._connected.connection.execute(
             "UPDATE track SET reveal = ?, revealed = ? WHERE digest = ?",
@@ -407,18 +407,18 @@ class SeasonStore(Store):
         )
 
     def check_closed(self, row: SeasonRow, time: str) -> None:
-        if time < row.closes:
+        if time < row.terms.closes:
             raise Rejection(
                 "season_not_closed",
-                f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
-                "until then.",
+                f"season={row.id}: closes at {row.terms.closes}, and it is {time}. Its tasks stay "
+                "secret until then.",
             )
 
     def _check_over(self, row: SeasonRow, time: str) -> None:
         """Reject (`season_not_closed`) a reveal while entrants can still play."""
         self.check_closed(row, time)
         running = [each.number for each in self.entrants(row.digest) if each.result is None]
-        if row.kind == "sealed-online" and running:
+        if row.terms.track == "sealed-online" and running:
             raise Rejection(
                 "season_not_closed",
                 f"season={row.id}: {len(running)} tickets run, the first of them number "
@@ -428,6 +428,3 @@ class SeasonStore(Store):
 
 def _is_revealed(row: SeasonRow) -> Rejection:
     return Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
-
-
-_SEASONS = f"SELECT {', '.join(SeasonRow._fields)} FROM track"

@@ -14,10 +14,11 @@ import logging
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from leaderboard.admission import check_entrant, check_manifest, uploader
 from leaderboard.documents.board import check_receiver
@@ -41,6 +42,8 @@ from leaderboard.store import Store
 from sme_registry import seasons
 from sme_registry.io import file_lock
 from sme_registry.seasons.wire import MAX_LANES, StepFormat, TicketStatus
+
+_T = TypeVar("_T")
 
 
 def deadline(season: Season, row: SealedRow) -> str:
@@ -203,8 +206,8 @@ class Sessions:
     def of_master(cls, store: SeasonStore, secret: str | os.PathLike[str]) -> list[Sessions]:
         """Those of each online season that is committed to the master in a file."""
         master = Master.read(secret)
-        online = [store.season(row.id) for row in store.seasons() if row.kind == "sealed-online"]
-        found = [cls(store, each, master) for each in online if each.is_committed_to(master)]
+        terms = [row.terms for row in store.seasons() if row.terms.track == "sealed-online"]
+        found = [cls(store, each, master) for each in terms if each.is_committed_to(master)]
         if not found:
             raise BoardError(
                 f"{secret}: is the master of no sealed-online season of this board. Give the file "
@@ -237,6 +240,14 @@ class Sessions:
                 "Send `Bearer` and the token that the board answered when the ticket started.",
             )
         return ticket
+
+    def use(self, number: int, token: str, instance: int, use: Callable[[Instance], _T]) -> _T:
+        """What a function returns of an instance of a ticket, for whoever has its password."""
+        with storage():
+            used = self.open(number, token).instance(instance)
+            result = use(used)
+            self.hold(used)
+        return result
 
     def is_ready(self, number: int, instance: int) -> bool:
         """Whether the next step of an instance does not block."""

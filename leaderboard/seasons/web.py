@@ -21,7 +21,7 @@ import functools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from anyio import CapacityLimiter, to_thread
@@ -83,7 +83,7 @@ SECTION = Section(("seasons.html", "Seasons"), Path(__file__).parent, _files)
 
 
 def _page(pages: Pages, store: SeasonStore, row: SeasonRow) -> str:
-    season = store.season(row.digest)
+    season = row.terms
     rankings = season_rankings(store, season, "wd_regret")
     # The scorer of the reference rows has scored the entries, too.
     if pages.preparing and any(rankings.values()):
@@ -92,11 +92,11 @@ def _page(pages: Pages, store: SeasonStore, row: SeasonRow) -> str:
         "season.html",
         here="",
         root="../",
-        title=row.title,
+        title=season.title,
         reasons=REASONS,
         row=row,
         season=season,
-        online=row.kind == "sealed-online",
+        online=season.track == "sealed-online",
         settings=[setting_text(member.setting) for member in season.classes],
         entrants=_entrants(store, row, {each.id for each in counting(store, season)}),
         rankings=rankings,
@@ -200,8 +200,7 @@ class SeasonRoutes:
         def view() -> dict[str, Any]:
             row = self._store.season_row(name)
             master = self._store.revealed_master(row.digest).raw.hex() if row.reveal else None
-            document = self._store.season(row.digest).to_dict()
-            return {**self._view(row), "document": document, "master": master}
+            return {**self._view(row), "document": row.terms.to_dict(), "master": master}
 
         return JSONResponse(await self._in_thread(view))
 
@@ -211,7 +210,7 @@ class SeasonRoutes:
 
         def ranked() -> bytes:
             row = self._store.season_row(name)
-            facts = ranking_facts(self._store, self._store.season(row.digest), metric)
+            facts = ranking_facts(self._store, row.terms, metric)
             return to_json({**self._view(row), "metric": metric, "ranking": facts}).encode()
 
         return Response(await _run(ranked, self._rankings), media_type="application/json")
@@ -258,10 +257,10 @@ class SeasonRoutes:
         return {
             "id": row.id,
             "digest": row.digest,
-            "title": row.title,
-            "track": row.kind,
-            "opens": row.opens,
-            "closes": row.closes,
+            "title": row.terms.title,
+            "track": row.terms.track,
+            "opens": row.terms.opens,
+            "closes": row.terms.closes,
             "revealed": row.revealed or None,
             "served": row.id in self._sessions,
         }
@@ -296,13 +295,13 @@ class SeasonRoutes:
         return JSONResponse({"id": signed.id}, 201 if new else 200)
 
     async def get_ticket(self, request: Request) -> Response:
-        of = self._ticket(request)
-        status = await self._in_thread(lambda: of.sessions.open(of.number, of.token).status)
+        sessions, number, token = self._ticket(request)
+        status = await self._in_thread(lambda: sessions.open(number, token).status)
         return JSONResponse(status.to_dict())
 
     async def end(self, request: Request) -> Response:
-        of, signature = self._ticket(request), _signature(request)
-        await self._in_thread(lambda: of.sessions.open(of.number, of.token).end(signature))
+        (sessions, number, token), signature = self._ticket(request), _signature(request)
+        await self._in_thread(lambda: sessions.open(number, token).end(signature))
         return Response()
 
     async def start(self, request: Request) -> Response:
@@ -323,21 +322,21 @@ class SeasonRoutes:
         return Response(status_code=201 if new else 200)
 
     async def step(self, request: Request) -> Response:
-        of, number = self._ticket(request), _path_number(request, "instance")
-        body = await read_body(request, of.sessions.step_bytes, "steps")
+        (sessions, number, token), instance = self._ticket(request), _instance(request)
+        body = await read_body(request, sessions.step_bytes, "steps")
         signature = _signature(request)
 
-        def step(instance: Instance) -> bytes:
-            return instance.step(body, signature)
+        def step() -> bytes:
+            return sessions.use(number, token, instance, lambda it: it.step(body, signature))
 
-        if of.sessions.is_ready(of.number, number):
-            return _octets(of.use(number, step))
-        return _octets(await self._in_thread(lambda: of.use(number, step)))
+        if sessions.is_ready(number, instance):
+            return _octets(step())
+        return _octets(await self._in_thread(step))
 
     async def _used(self, request: Request, use: Callable[[Instance], _T]) -> _T:
         """What a thread does with the instance that a request is for, whose ticket runs."""
-        of, number = self._ticket(request), _path_number(request, "instance")
-        return await self._in_thread(lambda: of.use(number, use))
+        (sessions, number, token), instance = self._ticket(request), _instance(request)
+        return await self._in_thread(lambda: sessions.use(number, token, instance, use))
 
     def _served(self, request: Request) -> Sessions:
         season = request.path_params["season"]
@@ -349,27 +348,14 @@ class SeasonRoutes:
             "season_not_served", f"season={season}: {HTTP_CODES['season_not_served']}."
         )
 
-    def _ticket(self, request: Request) -> _Ticket:
+    def _ticket(self, request: Request) -> tuple[Sessions, int, str]:
+        """The tickets of a season, the number of one, and the password that came with it."""
         number = _path_number(request, "ticket")
         token = request.headers.get("Authorization", "").removeprefix("Bearer ")
-        return _Ticket(self._served(request), number, token)
+        return self._served(request), number, token
 
     async def _in_thread(self, work: Callable[[], _T]) -> _T:
         return await _run(work, self._threads)
-
-
-class _Ticket(NamedTuple):
-    """The ticket that a request is for, and the password that came with it."""
-
-    sessions: Sessions
-    number: int
-    token: str
-
-    def use(self, instance: int, use: Callable[[Instance], _T]) -> _T:
-        opened = self.sessions.open(self.number, self.token).instance(instance)
-        result = use(opened)
-        self.sessions.hold(opened)
-        return result
 
 
 async def _run(work: Callable[[], _T], limiter: CapacityLimiter) -> _T:
@@ -390,6 +376,10 @@ def _path_number(request: Request, name: str) -> int:
     if not (text.isascii() and text.isdigit()):
         raise RequestError("not_found", f"{HTTP_CODES['not_found']}.")
     return int(text) if len(text) < 10 else _LARGEST
+
+
+def _instance(request: Request) -> int:
+    return _path_number(request, "instance")
 
 
 def _signature(request: Request) -> str:

@@ -189,6 +189,11 @@ class Store:
                 self._follow_clock(self._connected)
             yield self._connected
 
+    def query(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
+        """The rows that answer a query of the index."""
+        with self.reading() as index:
+            return index.connection.execute(statement, values).fetchall()
+
     def record(self, event: str, subject: str, document: StrictModel) -> None:
         """Log a document in a transaction; a `Rejection` says why it is not allowed now."""
         key = self.signing_key()
@@ -381,9 +386,9 @@ class Store:
 
     def _read(self, column: str, id: str, kind: type[_Model]) -> _Model | None:
         """A document of a submission, whose digest in the log the index has in `column`."""
-        with self.reading() as index:
-            row = index.one(f"SELECT {column} FROM entry WHERE id = ? AND track = ''", id)
-        return None if row is None or row[0] is None else self.objects.document(kind, row[0])
+        rows = self.query(f"SELECT {column} FROM entry WHERE id = ? AND track = ''", id)
+        digest = rows[0][0] if rows else None
+        return None if digest is None else self.objects.document(kind, digest)
 
     def entries(self) -> list[EntryRow]:
         """All submissions, in the order in which they were received."""
@@ -408,11 +413,12 @@ class Store:
 
     def possesses(self, key: str, digest: str) -> bool:
         """Whether a key has uploaded an artefact: digests are public before the artefacts are."""
-        return self._exists(
+        held = self.query(
             "SELECT 1 FROM upload WHERE digest = ?1 AND key = ?2 UNION "
             "SELECT 1 FROM artefact JOIN entry ON id = submission WHERE digest = ?1 AND key = ?2",
             *(digest, key),
         )
+        return bool(held)
 
     def is_public(self, digest: str) -> bool:
         """Whether a file is a document, or belongs to a reference row or a scored submission.
@@ -420,27 +426,22 @@ class Store:
         Others are not published: who could download a policy that waits to be scored could submit
         it under another key, as if it were the first.
         """
-        return self._exists(
+        published = self.query(
             "SELECT 1 FROM artefact JOIN entry ON id = submission "
             "WHERE digest = ?1 AND (reference OR scores IS NOT NULL) UNION SELECT 1 FROM object "
             "WHERE digest = ?1 AND digest NOT IN (SELECT digest FROM artefact)",
             digest,
         )
-
-    def _exists(self, query: str, *values: str) -> bool:
-        with self.reading() as index:
-            return index.one(query, *values) is not None
+        return bool(published)
 
     def named_objects(self) -> list[str]:
         """The digests of all documents and policy files that logged documents name."""
-        return self._column("SELECT digest FROM object ORDER BY digest")
+        return [digest for (digest,) in self.query("SELECT digest FROM object ORDER BY digest")]
 
     def submission_times(self, key: str, since: str) -> list[str]:
         """When each entrant of a key, of any track, was received after a time, in order."""
-        return self._column(
-            "SELECT received FROM entry WHERE key = ? AND received > ? ORDER BY received",
-            *(key, since),
-        )
+        after = "SELECT received FROM entry WHERE key = ? AND received > ? ORDER BY received"
+        return [time for (time,) in self.query(after, key, since)]
 
     def holder_of_name(self, name: str) -> str | None:
         """The key that was first to use a submitter's name, in whatever case.
@@ -448,35 +449,31 @@ class Store:
         A name is used by an entrant of any track that waits for its scores, or has had scores of
         at least one policy: otherwise, policies that are rejected would be enough to occupy names.
         """
-        keys = self._column(
+        rows = self.query(
             "SELECT key FROM entry WHERE lower(submitter) = lower(?) AND "
             "(status = 'waiting' OR (scores IS NOT NULL AND policies > 0)) "
             "ORDER BY sequence LIMIT 1",
             name,
         )
-        return keys[0] if keys else None
-
-    def _column(self, query: str, *values: str) -> list[str]:
-        with self.reading() as index:
-            return [value for (value,) in index.connection.execute(query, values)]
+        return rows[0][0] if rows else None
 
     def uploaded_bytes(self, key: str, since: str) -> int:
         """Bytes that a key has sent, or caused as results, after a time as documents write it."""
-        with self.reading() as index:
-            return index.number(
-                "SELECT coalesce(sum(size), 0) FROM ("
-                "SELECT size FROM object WHERE key = ?1 AND received > ?2 UNION ALL "
-                "SELECT size FROM upload WHERE key = ?1 AND time > ?2)",
-                *(key, since),
-            )
+        [(size,)] = self.query(
+            "SELECT coalesce(sum(size), 0) FROM ("
+            "SELECT size FROM object WHERE key = ?1 AND received > ?2 UNION ALL "
+            "SELECT size FROM upload WHERE key = ?1 AND time > ?2)",
+            *(key, since),
+        )
+        return int(size)
 
     def total_bytes(self) -> int:
         """Bytes of all files; running tickets count with the most that they can take."""
-        with self.reading() as index:
-            return index.number(
-                "SELECT coalesce(sum(size), 0) + (SELECT coalesce(sum(reserved), 0) FROM entry) "
-                "FROM (SELECT digest, size FROM object UNION SELECT digest, size FROM upload)"
-            )
+        [(size,)] = self.query(
+            "SELECT coalesce(sum(size), 0) + (SELECT coalesce(sum(reserved), 0) FROM entry) "
+            "FROM (SELECT digest, size FROM object UNION SELECT digest, size FROM upload)"
+        )
+        return int(size)
 
 
 def unknown_submission(id: str) -> Rejection:

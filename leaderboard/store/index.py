@@ -63,8 +63,7 @@ CREATE TABLE head (
 ) STRICT, WITHOUT ROWID;
 CREATE TABLE track (
   digest TEXT PRIMARY KEY, sequence INTEGER NOT NULL, announced TEXT NOT NULL,
-  document TEXT NOT NULL, id TEXT NOT NULL UNIQUE, title TEXT NOT NULL, kind TEXT NOT NULL,
-  opens TEXT NOT NULL, closes TEXT NOT NULL, instances INTEGER NOT NULL,
+  document TEXT NOT NULL, id TEXT NOT NULL UNIQUE,
   reveal TEXT, revealed TEXT NOT NULL DEFAULT ''
 ) STRICT, WITHOUT ROWID;
 CREATE TABLE admitted (
@@ -380,10 +379,6 @@ class Index:
         """The first row of a query; None if there is none."""
         row: tuple[Any, ...] | None = self.connection.execute(statement, values).fetchone()
         return row
-
-    def number(self, statement: str, *values: Any) -> int:
-        """The number that a query for an aggregate returns."""
-        return int(self.connection.execute(statement, values).fetchone()[0])
 
     def status(self, id: str) -> Status | None:
         """A submission's status; None if there is no such submission."""

@@ -160,14 +160,13 @@ class Queue:
     def count(self, what: Counted) -> int:
         """How many there are of something in the queue."""
         statement = _COUNTED[what]
-        with self._store.reading() as index:
-            return index.number(f"SELECT {statement}", *(uptime() if "?1" in statement else ()))
+        values = uptime() if "?1" in statement else ()
+        [(count,)] = self._store.query(f"SELECT {statement}", *values)
+        return int(count)
 
     def places(self) -> dict[str, int]:
         """The place of each job and submission that waits, from 1: first come, first served."""
-        with self._store.reading() as index:
-            waiting = index.connection.execute(_WAITING).fetchall()
-        return {id: place for place, (id,) in enumerate(waiting, start=1)}
+        return {id: place for place, (id,) in enumerate(self._store.query(_WAITING), start=1)}
 
 
 def retry_seconds(faults: int) -> float:
@@ -188,7 +187,8 @@ def _end_lost(index: Index) -> None:
 def _end(index: Index, id: str, worker: str = "", *, fault: str = "") -> None:
     """End a claim, which `worker` may still finish; after a fault, its submission is postponed."""
     boot, at = uptime()
-    faults = index.number("SELECT faults FROM lease WHERE submission = ?", id) + bool(fault)
+    (faults,) = index.one("SELECT faults FROM lease WHERE submission = ?", id) or (0,)
+    faults += bool(fault)
     text = " ".join(fault.split())[:MAX_FAULT]
     index.connection.execute(
         "UPDATE lease SET worker = ?, held = 0, faults = ?, fault = coalesce(nullif(?, ''), fault),"

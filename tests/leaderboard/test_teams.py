@@ -9,7 +9,7 @@ from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.signed import SigningKey
-from leaderboard.documents.submission import Submission
+from leaderboard.documents.submission import Description, Submission
 from leaderboard.errors import Rejection
 from leaderboard.gate import sandbox
 from leaderboard.gate.networks import optimal_onnx
@@ -58,11 +58,10 @@ def bundle(folder, team):
     (folder / "runs.json").write_text(json.dumps(rows))
     made = make_bundle(
         folder / "bundle",
+        Description("Shared", "A Lab"),
         suite=FILE,
         key=KEY,
         runs=[folder / "runs.json"],
-        method="Shared",
-        submitter="A Lab",
     )
     return made.folder
 

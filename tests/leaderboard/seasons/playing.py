@@ -13,6 +13,7 @@ from leaderboard.admission import upload_header
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
 from leaderboard.seasons.entrant import request_ticket, signer_of
+from leaderboard.seasons.instance import Instance
 from leaderboard.seasons.season import Season, TicketRequest
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Sessions, Ticket, start_ticket
@@ -123,21 +124,21 @@ class Played:
     def open(self, instance=0):
         return self.sessions.open(self.number, self.token).instance(instance)
 
+    def use(self, instance, use):
+        return self.sessions.use(self.number, self.token, instance, use)
+
     def status(self, instance=0):
         return self.sessions.open(self.number, self.token).status.instances[instance]
 
     def start(self, lanes=LANES, instance=0):
-        opened = self.open(instance)
-        data = opened.start(lanes)
-        self.sessions.hold(opened)
+        data = self.use(instance, lambda it: it.start(lanes))
         if instance not in self.heads:
             self.heads[instance] = [self.chain(instance).first_head(lanes, data)]
         return data
 
     def send(self, body, instance=0):
-        opened, heads = self.open(instance), self.heads.get(instance, [b""])
-        answer = opened.step(body, self.signature(instance))
-        self.sessions.hold(opened)
+        heads, signature = self.heads.get(instance, [b""]), self.signature(instance)
+        answer = self.use(instance, lambda it: it.step(body, signature))
         if int.from_bytes(body[:8], "little") == len(heads):
             heads.append(next_head(heads[-1], body, answer))
         return answer
@@ -154,11 +155,10 @@ class Played:
         data = table if isinstance(table, bytes) else wire.pack_table(table)
         heads, states = self.heads.get(instance, [b""]), b""
         with contextlib.suppress(Rejection):  # as long as steps may follow
-            states = self.open(instance).challenge()
+            states = self.use(instance, Instance.challenge)
         head = answers_head(challenge_head(heads[-1], states), data)
-        return self.open(instance).answer(
-            data, self.sign(self.chain(instance).at(len(heads) + 1, head))
-        )
+        signature = self.sign(self.chain(instance).at(len(heads) + 1, head))
+        return self.use(instance, lambda it: it.answer(data, signature))
 
     def end(self):
         """Sign the heads of all instances, as the board has them."""
