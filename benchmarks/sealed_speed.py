@@ -22,8 +22,8 @@ import numpy as np
 
 from leaderboard.documents.signed import SigningKey
 from sme_registry import seasons
-from tests.leaderboard.seasons.killing import killable
 from tests.leaderboard.seasons.playing import online_board
+from tests.leaderboard.serving import serving_process
 
 CASES = ((1, 1), (1, 1), (1, 2), (1, 8), (16, 1), (256, 1))  # lanes, clients; the first warms up
 _WINDOW = 20  # requests
@@ -34,7 +34,7 @@ def main(seconds: float = 5.0) -> None:
     member = {"name": "deep", "setting": {"complexity": 5}, "instances": 16, "budget": 10**8}
     with tempfile.TemporaryDirectory() as folder:
         board = online_board(Path(folder), classes=[member])
-        with killable(board) as (url, server):
+        with serving_process(board.path, secrets=[board.secret]) as (url, server):
             ticket, instance = board.ticket(url, SigningKey.generate()), 0
             for lanes, clients in CASES:
                 queue: multiprocessing.Queue[Taken] = multiprocessing.Queue()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
@@ -179,6 +180,15 @@ def derived(store):
 @pytest.fixture
 def key():
     return SigningKey.generate()
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """The folder in which commands run, with the file of the user's key; wide lines."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+    return tmp_path
 
 
 @pytest.fixture

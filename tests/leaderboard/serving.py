@@ -23,7 +23,8 @@ from pathlib import Path
 from leaderboard.cli.admin import serve
 Config = uvicorn.Config
 uvicorn.Config = lambda *given, **named: Config(*given, **named | {"timeout_graceful_shutdown": 60})
-serve(Path(sys.argv[1]), port=0, workers=int(sys.argv[2]))
+board, workers, port, *secrets = sys.argv[1:]
+serve(Path(board), port=int(port), workers=int(workers), season_secret=list(map(Path, secrets)))
 """
 
 
@@ -41,7 +42,7 @@ def serving(path, seen=None, **options):
             yield url_of(listener)
         finally:
             server.should_exit = True
-            thread.join(10)
+            thread.join(60)
             assert not thread.is_alive()
 
 
@@ -82,11 +83,11 @@ def alive(pid):
 
 
 @contextlib.contextmanager
-def serving_process(path, workers=0):
+def serving_process(path, workers=0, port=0, secrets=()):
     """A server in a process, as `serve` runs it; yields its URL and the process."""
     root = Path(__file__).parents[2]
     process = subprocess.Popen(
-        [sys.executable, "-c", _SERVE, str(path), str(workers)],
+        [sys.executable, "-c", _SERVE, *map(str, (path, workers, port, *secrets))],
         cwd=root,
         env={**os.environ, "PYTHONPATH": str(root)},
         stdout=subprocess.PIPE,

@@ -383,14 +383,6 @@ def test_documents_count_like_artefacts(store, key):
 # Room on a full board.
 
 
-def test_a_full_board_accepts_no_submission(tmp_path, key):
-    limits = {"total_bytes": 2000, "artefact_bytes": 2000}
-    with tiny_board(tmp_path / "b", limits=limits) as store:
-        signed = uploaded(store, key, statement="x" * 1500)
-        assert code_of(lambda: receive(store, signed)) == "quota"
-        assert store.entries() == []
-
-
 def test_uploads_without_a_submission_expire_after_an_hour(tmp_path, key, monkeypatch):
     limits = {"total_bytes": 1000, "artefact_bytes": 900}
     one, two = sha256_of(b"1" * 300), sha256_of(b"2" * 300)

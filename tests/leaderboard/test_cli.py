@@ -74,12 +74,9 @@ def furnish(folder):
 
 
 @pytest.fixture(autouse=True)
-def _home(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+def _furnished(home, monkeypatch):
     monkeypatch.setattr(admin, "run_scorers", scored_here)
-    furnish(tmp_path)
+    furnish(home)
 
 
 def scored_here(board, workers, *, work, progress):

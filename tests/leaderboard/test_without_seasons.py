@@ -11,7 +11,6 @@ from pathlib import Path
 import httpx
 import pytest
 
-from leaderboard.cli.submit import KEY_VARIABLE
 from tests.leaderboard.test_cli import furnish
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,14 +30,12 @@ TINY = ("--suite", "tiny-v1.json")
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(home, monkeypatch):
     """Runs a command of a copy of the package in which the folder was deleted."""
-    package = tmp_path / "copy" / "leaderboard"
+    package = home / "copy" / "leaderboard"
     shutil.copytree(ROOT / "leaderboard", package, ignore=shutil.ignore_patterns("seasons"))
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(str, (package.parent, ROOT))))
-    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
-    furnish(tmp_path)
+    furnish(home)
 
     def run(*commands):
         every = (sys.executable, "-c", COMMANDS, json.dumps(commands))

@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
+from leaderboard.documents.result import METRICS, Estimate, Result, Scores
 from leaderboard.documents.submission import Submission
 from leaderboard.scoring.ranking import (
     failed_run,
     is_oracle_like,
     never_listed,
     result_of,
-    run_metrics,
 )
 from sme_registry import EvaluationProtocol
 from sme_registry.statistics import iqm
 from tests.leaderboard.conftest import document_of, plain_submission, suite_of
+from tests.leaderboard.store.synthetic import scored_run
 
 BOARD = document_of(suite_of(two=(2, {}), three=(3, {"complexity": 2})), draws=200)
 CLASS_OF = {digest: name for digest, (name, _) in BOARD.instances.items()}
@@ -33,16 +33,7 @@ def run(spec, regret):
         return failed_run(BOARD.protocol, CLASS_OF[spec], spec)
     if isinstance(regret, float):
         regret = [regret + 0.1 * level for level in LEVELS]
-    similarity = tuple(1.0 - 0.25 * N for N in regret)
-    return RunScore(
-        spec=spec,
-        class_name=CLASS_OF[spec],
-        artefact="sha256:" + "a" * 64,
-        evaluation_seed=0,
-        normalised_regret=tuple(regret),
-        similarity=similarity,
-        **run_metrics(regret, similarity, LEVELS),
-    )
+    return scored_run(BOARD.protocol, CLASS_OF[spec], spec, "sha256:" + "a" * 64, regret)
 
 
 def scored(regrets, unlisted=None):

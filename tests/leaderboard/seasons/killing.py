@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -25,14 +19,7 @@ from sme_registry import seasons
 from sme_registry.seasons.transcript import Chain, Transcript
 from sme_registry.seasons.wire import StepFormat
 from tests.leaderboard.seasons.playing import LANES
-
-_SERVE = """
-import sys
-from pathlib import Path
-from leaderboard.cli.admin import serve
-board, secret, port = sys.argv[1:]
-serve(Path(board), port=int(port), workers=0, season_secret=[Path(secret)])
-"""
+from tests.leaderboard.serving import serving_process
 
 
 @dataclass
@@ -66,78 +53,41 @@ def actions_of(ticket, requests):
         yield random.random((LANES, 1), dtype=np.float32)
 
 
-@contextlib.contextmanager
-def killable(board):
-    """A server on one port; yields its URL and what kills it."""
-    with listen("127.0.0.1", 0) as listener:
-        url = url_of(listener)
-    server = KillableServer(board, url)
-    try:
-        yield url, server
-    finally:
-        server.kill()
-
-
-class KillableServer:
-    """A server in a process, which starts again on its port after each kill."""
-
-    def __init__(self, board, url):
-        self._command = [
-            *(sys.executable, "-c", _SERVE, str(board.path), str(board.secret)),
-            url.rpartition(":")[2],
-        ]
-        self.start()
-
-    def start(self):
-        root = str(Path(__file__).parents[3])
-        self._process = subprocess.Popen(
-            self._command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": root}, text=True
-        )
-        assert self._process.stdout is not None
-        assert self._process.stdout.readline(), "the server did not start"
-
-    @property
-    def pid(self):
-        """Of the present process."""
-        return self._process.pid
-
-    def kill(self):
-        """End it as a loss of its process would."""
-        self._process.send_signal(signal.SIGKILL)
-        self._process.communicate()
-
-
 def step_through_kills(board, tickets, requests, kills):
     """Let entrants step at once while the server is killed, evenly over their requests.
 
     Their answers must be those of a replay of their own actions, and so must be the journals. The
     budget must be at least `requests` times `LANES`. Returns the seconds that it took.
     """
-    begun = time.monotonic()
-    with killable(board) as (url, server):
-        entrants = [
-            Entrant(board.ticket(url, SigningKey.generate(), number)) for number in range(tickets)
-        ]
-        together = threading.Barrier(tickets, timeout=600)
-        threads = [
-            threading.Thread(target=each.play, args=(url, requests, together), daemon=True)
-            for each in entrants
-        ]
-        for thread in threads:
-            thread.start()
-        for kill in range(1, kills + 1):
+    start = time.monotonic()
+    with listen("127.0.0.1", 0) as listener:
+        url = url_of(listener)
+    port, threads, entrants = url.rpartition(":")[2], [], []
+    for kill in range(1, kills + 2):
+        with serving_process(board.path, port=port, secrets=[board.secret]):
+            if not threads:
+                keys = enumerate(SigningKey.generate() for _ in range(tickets))
+                entrants = [Entrant(board.ticket(url, key, number)) for number, key in keys]
+                threads = begun(entrants, url, requests)
             due = tickets * requests * kill // (kills + 1)
             while sum(each.requests for each in entrants) < due and any(
                 thread.is_alive() for thread in threads
             ):
                 time.sleep(0.002)
-            server.kill()
-            server.start()
-        for thread in threads:
-            thread.join()
-    for each in entrants:
+    for thread, each in zip(threads, entrants, strict=True):
+        thread.join()
         check(board, each, requests)
-    return time.monotonic() - begun
+    return time.monotonic() - start
+
+
+def begun(entrants, url, requests):
+    """The threads in which entrants play."""
+    together = threading.Barrier(len(entrants), timeout=600)
+    arguments = url, requests, together
+    threads = [threading.Thread(target=each.play, args=arguments, daemon=True) for each in entrants]
+    for thread in threads:
+        thread.start()
+    return threads
 
 
 def check(board, entrant, requests):

@@ -71,15 +71,13 @@ def manifest(season, key, **fields):
     }
 
 
-def failed_result(season, subject):
-    """The result of an entry or a ticket of which every run failed, without a step."""
-    hidden = list(season.hidden)
-    runs = [failed_run(season.protocol, each.member.name, None) for each in hidden]
-    steps = [
-        Stepping(steps=0, normalised_online_regret=1.0, learning_curve=(1.0,))
-        for _ in hidden
-        if season.track == "sealed-online"
-    ]
+NO_STEP = Stepping(steps=0, normalised_online_regret=1.0, learning_curve=(1.0,))
+
+
+def failed_result(season, subject, stepping=NO_STEP):
+    """The result of an entry or a ticket of which every run failed."""
+    runs = [failed_run(season.protocol, each.member.name, None) for each in season.hidden]
+    steps = [stepping] * len(runs) if season.track == "sealed-online" else []
     return sealed_result(season, subject, runs, {"synthetic": "1"}, 100, steps)
 
 

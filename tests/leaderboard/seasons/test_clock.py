@@ -6,7 +6,6 @@ import time
 import httpx
 import pytest
 
-from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.scoring.worker import Work, beside, run_scorer
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import ScoreTicket
@@ -23,11 +22,9 @@ MONTH = 24.0 * 30
 
 
 @pytest.fixture
-def board(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+def board(home, monkeypatch):
     monkeypatch.setattr(SeasonRoutes, "job", None)
-    return online_board(tmp_path)
+    return online_board(home)
 
 
 @contextlib.contextmanager

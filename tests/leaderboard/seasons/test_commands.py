@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.publication import read_season
 from leaderboard.seasons.season import Master
@@ -25,14 +24,11 @@ LONG = "x" * 300
 
 
 @pytest.fixture(autouse=True)
-def _home(tmp_path, monkeypatch):
-    """A board, a key and the plan of a season."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+def _furnished(home):
+    """A board, keys and the plan of a season."""
     SigningKey.generate().write("my.key")
     SigningKey.generate().write("other.key")
-    tiny_board(tmp_path / "board").close()
+    tiny_board(home / "board").close()
     fields = tiny_terms(id="autumn").to_dict()
     del fields["published"]
     Path(PLAN).write_text(json.dumps(fields))

@@ -8,45 +8,20 @@ import pytest
 import rfc8785
 
 from leaderboard.errors import BoardError
-from leaderboard.seasons.season import PLANNED, Master, Place, Purpose, Reveal, Season
+from leaderboard.seasons.season import Master, Place, Purpose, Reveal, Season
 from sme_registry import SMESpec
 from sme_registry.errors import SpecError
+from tests.leaderboard.seasons.sealing import MASTER, OPENS, SETTING, moment, tiny_terms
 
-MASTER = Master(bytes(range(32)))
 PURPOSES = get_args(Purpose)
-SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5}
 
 
 def online(**fields):
-    return {
-        "id": "autumn",
-        "title": "Autumn",
-        "track": "sealed-online",
-        "classes": [{"name": "deep", "setting": SETTING, "instances": 2, "budget": 1000}],
-        "opens": "2026-01-01T00:00:00Z",
-        "closes": "2026-02-01T00:00:00Z",
-        "protocol_name": "quick-v1",
-        "protocol": {},
-        "ticket_hours": 24,
-        "tickets": 100,
-        "tickets_per_key": 3,
-        "commitment": PLANNED,
-        **fields,
-    }
+    return {**tiny_terms("sealed-online").to_dict(), **fields}
 
 
 def offline(**fields):
-    digests = {"data": "sha256:" + "1" * 64, "challenge": "sha256:" + "2" * 64}
-    data = {"nu": 0.5, "transitions": 100}
-    own = {
-        "track": "sealed-offline",
-        "ticket_hours": None,
-        "tickets": None,
-        "tickets_per_key": None,
-        "classes": [{"name": "deep", "setting": SETTING, "instances": 2, "data": data}],
-        "published": [{"class_name": "deep", "instance": i, **digests} for i in (0, 1)],
-    }
-    return online(**{**own, **fields})
+    return {**tiny_terms().to_dict(), **fields}
 
 
 @pytest.mark.parametrize("track", [online, offline])
@@ -63,7 +38,7 @@ def test_a_season_is_committed_to_its_master_and_to_every_term(track):
     assert not season.is_committed_to(Master(bytes(32)))
     last = "1" if season.commitment[-1] == "0" else "0"
     for name, value in (
-        ("closes", "2026-02-02T00:00:00Z"),
+        ("closes", moment(2)),
         ("commitment", season.commitment[:-1] + last),
     ):
         assert not Season.from_dict({**season.to_dict(), name: value}).is_committed_to(MASTER)
@@ -141,7 +116,7 @@ def test_a_reveal_has_32_bytes():
         (online(ticket_hours=0.0), "ticket_hours=0.0: must be"),
         (offline() | {"tickets": 3}, "tickets: must be null"),
         (offline() | {"published": offline()["published"][::-1]}, "published: must list every"),
-        (online(closes="2026-01-01T00:00:00Z"), "must be after opens"),
+        (online(closes=OPENS), "must be after opens"),
         (online(opens="2025-02-30T00:00:00Z"), "2025-02-30T00:00:00Z: is no date"),
         (online(protocol={"seed": 1}), "seed=1: must be 0"),
     ],

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from leaderboard.admission import upload_header
-from leaderboard.documents.signed import Receiver, Signed, SigningKey
-from leaderboard.errors import Rejection
+from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.seasons.season import TicketRequest
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.tickets import start_ticket
 from sme_registry import seasons
 from sme_registry.seasons import wire
 from tests.leaderboard.seasons.killing import step_through_kills
@@ -99,15 +97,6 @@ def test_a_season_that_is_open_and_a_key_have_only_so_many_tickets(url, board, k
     assert outcome(board.send(url, board.request(key, 2), key)) == (429, "ticket_limit")
     coming = another(board, "coming")
     assert outcome(coming.send(url, coming.request(key), key)) == (422, "season_not_open")
-
-
-def test_tickets_count_towards_the_quota_of_a_day(tmp_path, key):
-    board = online_board(tmp_path, limits={"submissions_per_day": 1})
-    with SeasonStore.open(board.path) as store:
-        store.add(board.request(key))
-        envelope = Signed[TicketRequest].read(board.request(key, 1).to_bytes())
-        with pytest.raises(Rejection, match="quota"):
-            start_ticket(store, envelope)
 
 
 def test_a_request_that_others_read_is_no_password(url, board, key):

@@ -3,8 +3,6 @@
 import pytest
 
 from leaderboard import admission
-from leaderboard.scoring.ranking import failed_run
-from leaderboard.seasons.scoring import sealed_result
 from leaderboard.seasons.season import Reveal, Stepping
 from leaderboard.seasons.web import SECTION
 from leaderboard.web.pages import Pages
@@ -12,6 +10,7 @@ from leaderboard.web.server import write_site
 from tests.leaderboard.clocks import move_clock
 from tests.leaderboard.seasons.sealing import (
     MASTER,
+    failed_result,
     signed_entry,
     signed_request,
     tiny_season,
@@ -23,11 +22,7 @@ HOSTILE = "Autumn <script>alert(1)</script>"
 OFFLINE, ONLINE = tiny_season(id="autumn", title=HOSTILE), tiny_season("sealed-online", id="winter")
 
 
-def result(season, subject):
-    runs = [failed_run(season.protocol, each.member.name, None) for each in season.hidden]
-    curve = Stepping(steps=64, normalised_online_regret=0.625, learning_curve=(1.0, 0.75, 0.125))
-    steps = [curve] * len(runs) if season is ONLINE else []
-    return sealed_result(season, subject, runs, {}, 100, steps)
+CURVE = Stepping(steps=64, normalised_online_regret=0.625, learning_curve=(1.0, 0.75, 0.125))
 
 
 def entry(store, key, knowledge="generic", note=""):
@@ -70,7 +65,7 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
     move_clock(monkeypatch)
     board.reveal(Reveal(season=OFFLINE.digest, master=MASTER.raw.hex()))
     for id in (last, fitted):
-        board.finish(result(OFFLINE, id))
+        board.finish(failed_result(OFFLINE, id))
     after = page(board, "seasons/autumn.html")
     assert MASTER.raw.hex() in after.words
     generic, family = (after.words.index(f"Methods {text}") for text in ("without", "that declare"))
@@ -91,7 +86,7 @@ def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key):
     over = page(board, "seasons/winter.html").words
     assert "waits to be scored: place 1 of 1 in the queue" in over
     assert "running" not in over
-    board.finish(result(ONLINE, request.id))
+    board.finish(failed_result(ONLINE, request.id, CURVE))
     ended = page(board, "seasons/winter.html")
     assert "0.625" in ended.words
     labels = [svg.get("aria-label", "") for svg in ended.all("svg")]
@@ -108,7 +103,7 @@ def test_a_season_is_shown_before_the_boards_reference_rows_but_not_its_scores(
         request = signed_request(board, ONLINE, key)
         board.add(request)
         assert "running" in page(board, "seasons/winter.html", address="http://board.test").words
-        board.finish(result(ONLINE, request.id))
+        board.finish(failed_result(ONLINE, request.id, CURVE))
         prepares = page(board, "seasons/winter.html", address="http://board.test")
     assert "Preparing." in prepares.words
     assert "0.625" not in prepares.words

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from leaderboard.cli.submit import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.seasons import entrant
@@ -21,12 +20,9 @@ from tests.leaderboard.web.test_client import scripted
 
 
 @pytest.fixture
-def board(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+def board(home):
     SigningKey.generate().write("my.key")
-    return online_board(tmp_path)
+    return online_board(home)
 
 
 @pytest.fixture

@@ -45,6 +45,10 @@ def test_a_grown_index_equals_a_rebuilt_one_in_the_same_file(tmp_path, key):
     (tmp_path / "copy" / "index.sqlite").unlink()
     with Store.open(tmp_path / "copy") as store, Store.open(tmp_path / "board") as other:
         assert derived(store) == derived(other)
+        rows = store.entries()
+        store.folder.objects.rename(tmp_path / "objects")  # a page reads none of their files
+        assert store.entries() == rows
+        assert store.entry(rows[0].id) == rows[0]
 
 
 @pytest.fixture(scope="module")

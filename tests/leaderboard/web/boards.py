@@ -2,14 +2,15 @@
 
 import numpy as np
 
-from leaderboard.documents.result import Result, RunScore
+from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import Submission
-from leaderboard.scoring.ranking import levels_of, never_listed, result_of, run_metrics
+from leaderboard.scoring.ranking import levels_of, never_listed, result_of
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.io import sha256_of
 from sme_registry.spec import EvaluationProtocol
 from tests.leaderboard.conftest import suite_of
+from tests.leaderboard.store.synthetic import scored_run
 
 CREATED = "2026-11-21T09:30:00Z"
 HOSTILE = "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>&amp;"
@@ -100,25 +101,15 @@ def score(store, profile, spread=0.0):
     """Write a result of about this profile for the submission whose turn it is; its id."""
     document, claim = store.document, claimed(store)
     submission = store.submission(claim.id).content
-    levels = levels_of(document.protocol)
+    levels, instances = levels_of(document.protocol), document.instances
     # Not from the id, which holds a key that is new each time.
     name = f"{submission.method.name} {submission.method.version}"
     rng = np.random.default_rng(int(_digest(name)[7:23], 16))
     runs = []
     for number, run in enumerate(submission.runs):
         regret = np.abs(np.asarray(profile) + spread * rng.normal(size=len(levels)))
-        similarity = 1.0 - 0.25 * regret
-        runs.append(
-            RunScore(
-                spec=run.spec,
-                class_name=document.instances[run.spec][0],
-                artefact=run.artefact.sha256,
-                evaluation_seed=2**52 + 7919 * number,
-                normalised_regret=tuple(regret.tolist()),
-                similarity=tuple(similarity.tolist()),
-                **run_metrics(regret, similarity, levels),
-            )
-        )
+        of_run = instances[run.spec][0], run.spec, run.artefact.sha256, regret.tolist()
+        runs.append(scored_run(document.protocol, *of_run, seed=2**52 + 7919 * number))
     unlisted = never_listed(document, submission)
     result = result_of(document, claim.id, runs, VERSIONS, unlisted=unlisted)
     assert store.queue.finish(claim, result)
