@@ -195,33 +195,6 @@ def test_without_a_mixing_the_agent_sees_state_and_distractors():
     assert (SMESpec().observation_dim, task.spec.observation_dim) == (10, 13)
 
 
-def test_an_orthogonal_mixing_turns_about_the_centre_and_shrinks_no_more_than_it_must():
-    task = task_of(distractors=8, mixing="orthogonal")
-    ((W, _),) = task.mixing
-    c = 1.0 / np.linalg.norm(W, axis=1)
-    np.testing.assert_allclose(c, c[0])
-    np.testing.assert_allclose(W @ W.T * c[0] ** 2, np.eye(16), atol=1e-14)
-    np.testing.assert_allclose(task.seen(np.full(8, 0.5), np.full(8, 0.5)), 0.5, atol=1e-15)
-    widest = np.abs(W).sum(axis=1).argmax()
-    corner = (np.sign(W[widest]) + 1) / 2
-    assert task.seen(corner[:8], corner[8:])[widest] == pytest.approx(1.0)
-
-
-def test_a_nonlinear_mixing_is_its_uniform_layers():
-    task = task_of(distractors=4, mixing="nonlinear", mixing_depth=3)
-    s, d = inside(task)
-    x = np.concatenate([s, d], axis=1)
-    for W, b in task.mixing:
-        np.testing.assert_allclose(W @ W.T, 12.0 * np.eye(12), atol=1e-12)
-        np.testing.assert_allclose(W @ np.full(12, 0.5) + b, 0.0, atol=1e-14)
-        x = ndtr(x @ W.T + b)
-    np.testing.assert_allclose(task.seen(s, d), x, rtol=0, atol=1e-15)
-    shallow = task_of(distractors=4, mixing="nonlinear", mixing_depth=2)
-    assert (len(shallow.mixing), len(task.mixing)) == (2, 3)
-    for one, other in zip(shallow.mixing, task.mixing[:2], strict=True):
-        np.testing.assert_array_equal(one.W, other.W)
-
-
 @given(observed_tasks())
 def test_distractors_move_by_the_equations_of_the_state(task):
     if task.distractor_transition is None:
