@@ -153,7 +153,7 @@ class SeasonRoutes:
         self._threads = CapacityLimiter(_WORKERS)
         self._requests = CapacityLimiter(1)
         self._entries = CapacityLimiter(1)
-        self._rankings = CapacityLimiter(1)
+        self._lists = CapacityLimiter(1)  # rankings and files: long ones keep no step waiting
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
@@ -213,7 +213,7 @@ class SeasonRoutes:
             facts = ranking_facts(self._store, row.terms, metric)
             return to_json({**self._view(row), "metric": metric, "ranking": facts}).encode()
 
-        return Response(await _run(ranked, self._rankings), media_type="application/json")
+        return Response(await _run(ranked, self._lists), media_type="application/json")
 
     async def get_files(self, request: Request) -> Response:
         start = _query(request, "start", "0")
@@ -227,7 +227,7 @@ class SeasonRoutes:
                 if path.is_file()
             ]
 
-        listed = await self._in_thread(files)
+        listed = await _run(files, self._lists)
         end = start + _FILES
         more = end if end < len(listed) else None
         return JSONResponse({"files": listed[start:end], "next": more})

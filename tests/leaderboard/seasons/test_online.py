@@ -1,5 +1,6 @@
 """Seasons over HTTP, with the client that entrants use, and what follows a ticket that is over."""
 
+import threading
 import time
 
 import httpx
@@ -10,6 +11,7 @@ from leaderboard.admission import upload_header
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.seasons.season import TicketRequest
 from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.web import SeasonRoutes
 from sme_registry import seasons
 from sme_registry.seasons import wire
 from tests.leaderboard.seasons.killing import step_through_kills
@@ -156,6 +158,32 @@ def test_the_ranking_grows_as_tickets_end(url, board, key):
     assert outcome(httpx.get(address, params={"metric": "luck"})) == (400, "bad_request")
     unknown = httpx.get(f"{url}/api/seasons/none/ranking")
     assert outcome(unknown) == (404, "season_unknown")
+
+
+def test_long_lists_of_files_keep_no_ticket_waiting(url, board, key, monkeypatch):
+    ticket, go_on, listing = board.ticket(url, key), threading.Event(), threading.Semaphore(0)
+    parts = SeasonRoutes._public_parts
+
+    def slow(*arguments):
+        listing.release()
+        assert go_on.wait(60)
+        return parts(*arguments)
+
+    monkeypatch.setattr(SeasonRoutes, "_public_parts", slow)
+    path = f"{url}/api/seasons/{board.season.id}/files"
+    get = {"target": httpx.get, "args": (path,), "kwargs": {"timeout": 60, "trust_env": False}}
+    threads = [threading.Thread(**get) for _ in range(8)]
+    for each in threads:
+        each.start()
+    assert listing.acquire(timeout=60)
+    try:
+        with seasons.Instance(url, ticket, patience=5.0) as instance:
+            monkeypatch.setattr(wire, "_TIMEOUT", 5.0)
+            assert instance.status().phase == "running"
+    finally:
+        go_on.set()
+        for each in threads:
+            each.join()
 
 
 @pytest.mark.parametrize(
