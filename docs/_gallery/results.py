@@ -58,7 +58,7 @@ _LIMITS = "limits-and-distractors"
 STUDIES = (
     Study("ablations-in-jax/runs-20000.csv", "ablations.md", "paper-ablations", _BY_REGION),
     Study("ablations-in-jax/runs.csv", "ablations.md", "paper-ablations", _BY_REGION),
-    Study("baselines.csv", "ablations.md#on-smoke-v1-by-the-rule-of-a-board", "smoke", _TOGETHER),
+    Study("baselines.csv", "agents.md#on-smoke-v1-by-the-rule-of-a-board", "smoke", _TOGETHER),
     *(
         Study(
             f"{_LIMITS}/{name}.csv",

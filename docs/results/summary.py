@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from sme_registry import evaluate, load
+from sme_registry import Profile, evaluate, load
 
 RESULTS = Path(__file__).parent
 RUN = ["algorithm", "class_name", "run", "steps", "complexity", "spec_digest", "seed", "uses"]
@@ -70,6 +70,41 @@ def each_run(runs: pd.DataFrame) -> pd.DataFrame:
     return rounded.pivot_table(
         index="class_name", columns="algorithm", values="n", aggfunc=", ".join, sort=False
     )
+
+
+def discounts() -> pd.DataFrame:
+    """PPO's N₀ by γ, and of γ = 0 minus 0.99 the mean over pairs by instance, with its interval."""
+    runs = pd.concat([rows("ablations-in-jax", f"{name}.csv") for name in ("runs", "runs-gamma")])
+    return paired(runs, "normalised_regret_0", "PPO (gamma 0)", "PPO")
+
+
+def profiles() -> pd.DataFrame:
+    """N₀ of five runs of 20,000 steps, where each has so many, and of clones; TD3 minus PPO."""
+    agents = [*Profile.references().values()]
+    agents += [Profile.read(path) for path in RESULTS.glob("unfinished-profiles/*.json")]
+    runs = [
+        row.model_dump() | {"algorithm": profile.algorithm.name}
+        for profile in agents
+        for row in profile.rows
+        if len(profile.values(row.class_name)) == profile.seeds
+    ]
+    clones = pd.read_csv(RESULTS / "ablations-in-jax" / "clones.csv")
+    clones["algorithm"] = "clone, " + clones["algorithm"]
+    return paired(pd.concat([pd.DataFrame(runs), clones]), "wd_regret", "TD3", "PPO")
+
+
+def paired(runs: pd.DataFrame, value: str, one: str, other: str) -> pd.DataFrame:
+    """Means by class and algorithm; one minus other over pairs by instance, with t's interval."""
+    wide = runs.pivot_table(
+        index=["class_name", "run"], columns="algorithm", values=value, sort=False
+    )
+    change = (wide[one] - wide[other]).groupby(level=0, sort=False)
+    n, mean = change.count(), change.mean()
+    arm = stats.t.ppf(0.975, n - 1) * change.std() / np.sqrt(n)
+    table = wide.groupby(level=0, sort=False).mean()
+    columns = {"difference": mean, "low": mean - arm, "high": mean + arm, "pairs": n}
+    lower = (change.apply(lambda pairs: (pairs < 0).sum())).rename("lower")
+    return table.assign(**columns, lower=lower).round(2)
 
 
 def losses(runs: pd.DataFrame) -> pd.DataFrame:
@@ -155,6 +190,8 @@ def equality(runs: pd.DataFrame) -> pd.DataFrame:
 def ablations() -> Iterator[Any]:
     """Levels by class, and of policies that learn nothing."""
     yield classes(rows("ablations-in-jax", "runs.csv"))
+    yield discounts()
+    yield profiles()
     runs = rows("ablations-in-jax", "runs-20000.csv")
     yield each_run(runs)
     yield classes(runs)["wd_regret"]

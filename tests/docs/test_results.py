@@ -57,7 +57,7 @@ def part(page, begin, end):
 @pytest.mark.parametrize(
     ("page", "begin", "end"),
     [
-        ("ablations", "## PPO, ten runs", "## On `smoke-v1`"),
+        ("ablations", "## PPO, ten runs", "- **What is missing"),
         ("decay", "| 100,000 steps", "The paper reports"),
         ("decay", "| | cosine", "It is no evidence"),
         ("foresight", "| misleading − control", "- **On the plain"),
