@@ -300,18 +300,18 @@ class Store:
 
     def _connect(self, *, rebuild: bool) -> None:
         """Connect to the index, rebuilt in place if necessary, while the board is locked."""
-        with self.locked():
+        with self.locked(), self._explained():
+            self._index = self._index or Index(
+                self.objects, self.document, self.kinds, in_memory=self.read_only
+            )
             if self.read_only:
-                self._index = Index.empty(self.objects, self.document, self.kinds)
                 return
-            with self._explained():
-                self._index = self._index or Index.open(self.objects, self.document, self.kinds)
-                if not rebuild and self._index.is_current:
-                    self._refuse_lost_log(self._index.head)
-                    return
-                with self._writing() as index:
-                    index.clear()
-                    self._catch_up(index)
+            if not rebuild and self._index.is_current:
+                self._refuse_lost_log(self._index.head)
+                return
+            with self._writing() as index:
+                index.clear()
+                self._catch_up(index)
 
     def _refuse_lost_log(self, head: Head) -> None:
         """Check that the log still has the index's last entry; an index is never ahead of it."""

@@ -122,17 +122,18 @@ _OF_LEASE = {"faults": "coalesce(faults, 0)", "fault": "coalesce(fault, '')"}
 class Index:
     """A connection to a database with the schema's tables, of a board's document and objects.
 
-    `kinds` are those of the log's entries that further tracks add.
+    `kinds` are those of the log's entries that further tracks add. In memory, or if it grows in a
+    file that no other process sees, it is empty at first.
     """
 
     def __init__(
-        self,
-        connection: sqlite3.Connection,
-        objects: Objects,
-        document: BoardDocument,
-        kinds: Kinds,
+        self, objects: Objects, document: BoardDocument, kinds: Kinds, *, in_memory: bool
     ) -> None:
-        self.connection, self.objects, self.document = connection, objects, document
+        self.objects, self.document = objects, document
+        self.connection = _connect("") if in_memory else _reopened(objects.folder.index)
+        if in_memory:
+            with self.transaction():
+                self.clear()
         self._kinds: Kinds = {
             "opened": self._opened,
             "received": self._received,
@@ -142,29 +143,6 @@ class Index:
             **kinds,
         }
         self._written: StrictModel | None = None
-
-    @classmethod
-    def open(cls, objects: Objects, document: BoardDocument, kinds: Kinds) -> Index:
-        """Connect to a board's index, in a new file if there is none or the old one is unusable."""
-        path = objects.folder.index
-        try:
-            connection = _opened(path)
-        except (sqlite3.Error, OSError):
-            try:
-                for each in _files_of(path):
-                    each.unlink(missing_ok=True)
-                connection = _opened(path)
-            except OSError as error:
-                raise unwritable(path, error) from error
-        return cls(connection, objects, document, kinds)
-
-    @classmethod
-    def empty(cls, objects: Objects, document: BoardDocument, kinds: Kinds) -> Index:
-        """An empty index in memory, or if it grows in a file that no other process sees."""
-        index = cls(_connect(""), objects, document, kinds)
-        with index.transaction():
-            index.clear()
-        return index
 
     @property
     def is_current(self) -> bool:
@@ -416,6 +394,18 @@ class Index:
 def _files_of(index: Path) -> list[Path]:
     """The paths of a database and of what SQLite writes beside it."""
     return [index.with_name(index.name + end) for end in ("", "-wal", "-shm", "-journal")]
+
+
+def _reopened(index: Path) -> sqlite3.Connection:
+    """Connect to a file, a new one if there is none or the old one is unusable."""
+    with contextlib.suppress(sqlite3.Error, OSError):
+        return _opened(index)
+    try:
+        for path in _files_of(index):
+            path.unlink(missing_ok=True)
+        return _opened(index)
+    except OSError as error:
+        raise unwritable(index, error) from error
 
 
 def _opened(index: Path) -> sqlite3.Connection:
