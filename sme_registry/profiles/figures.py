@@ -10,15 +10,7 @@ import numpy as np
 
 from sme_registry.plots.style import GREY, draw_band, literal, new_figure, styled
 from sme_registry.profiles.levels import AXES, COMPARED, Axis
-from sme_registry.studies.report.figures.panels import (
-    LINEAR,
-    WIDTH,
-    Look,
-    legend,
-    numbered_looks,
-    panel_grid,
-    side_by_side,
-)
+from sme_registry.studies.report.figures import panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,18 +22,18 @@ _HIGHEST = 1.45  # N₀ that the figure shows
 _LEAST, _MOST = -0.6, 1.35  # robustness
 
 
-def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, Look]:
+def _looks(profile: Profile, others: Sequence[Profile]) -> dict[str, panels.Look]:
     """The profile in front; a method of several discounts has one colour. The constant has none."""
     methods = [other.name.partition(" (")[0] for other in others if other.learns]
-    numbered = numbered_looks(dict.fromkeys(("", *COMPARED, *methods)))
+    numbered = panels.numbered_looks(dict.fromkeys(("", *COMPARED, *methods)))
     solid, hollow = {"linestyle": "-"}, {"linestyle": (0, (2, 1.5)), "markerfacecolor": "none"}
-    looks: dict[str, Look] = {profile.name: {**numbered[""], **solid}}
+    looks: dict[str, panels.Look] = {profile.name: {**numbered[""], **solid}}
     for other in others:
         method, _, variant = other.name.partition(" (")
         if other.learns:
             looks[other.name] = {**numbered[method], **(hollow if variant else solid)}
         elif other.name == "linear":
-            looks[other.name] = LINEAR
+            looks[other.name] = panels.LINEAR
     return looks
 
 
@@ -60,10 +52,10 @@ def draw_axes(profile: Profile, others: Sequence[Profile]) -> Figure:
         axes.grid(visible=False, axis="x")
 
     items = [(axis.label, axis) for axis in AXES]
-    return panel_grid(items, draw, (0.7, 1.75), y="N₀", looks=looks)
+    return panels.grid(items, draw, (0.7, 1.75), y="N₀", looks=looks)
 
 
-def _draw_line(axes: Axes, profile: Profile, axis: Axis, look: Look, *, front: bool) -> None:
+def _draw_line(axes: Axes, profile: Profile, axis: Axis, look: panels.Look, *, front: bool) -> None:
     levels = enumerate(map(profile.level, axis.levels))
     points = [(i, level.value, level.low, level.high) for i, level in levels if level.draws]
     if not points:
@@ -84,9 +76,9 @@ def draw_robustness(profile: Profile, others: Sequence[Profile]) -> Figure:
         name: {**look, "marker": look["marker"] or "D", "linestyle": "none"}
         for name, look in looks.items()
     }
-    figure = new_figure((WIDTH, 1.2 + 0.36 * len(AXES)))
+    figure = new_figure((panels.WIDTH, 1.2 + 0.36 * len(AXES)))
     axes = figure.add_subplot()
-    for name, look, shift in side_by_side(looks, 0.6):
+    for name, look, shift in panels.side_by_side(looks, 0.6):
         for row, axis in enumerate(AXES):
             kept = by_name[name].robustness(axis, profile.classes)
             if not kept.draws:
@@ -104,5 +96,5 @@ def draw_robustness(profile: Profile, others: Sequence[Profile]) -> Figure:
     axes.set_xlim(_LEAST, _MOST)
     axes.set_xlabel("robustness: share of the performance 1 − N₀ that is kept at the harder levels")
     axes.grid(visible=False, axis="y")
-    legend(figure, looks)
+    panels.legend(figure, looks)
     return figure

@@ -21,6 +21,7 @@ Of streams there are also, with the columns that name the row first, the tables
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -103,8 +104,7 @@ class Analysis:
     first. `places` has a row for each planned cell; its state is `finished`, `failed`, `missing`,
     or `left out` where no run of its class and algorithm has ended. `algorithms` have a finished
     run on a single task; `learners` are those of them that learn; `coloured` are all that learn,
-    so that a method has one colour in every figure of a study. `reference_costs` are by class of
-    streams and reference, one for each draw.
+    so that a method has one colour in every figure of a study.
     """
 
     file: StudyFile
@@ -120,7 +120,6 @@ class Analysis:
     groups: tuple[Group, ...]
     runs: pd.DataFrame
     lives: tuple[FinishedLife, ...]
-    reference_costs: Mapping[tuple[str, str], Sequence[DynamicRegret]]
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
 
     @property
@@ -131,6 +130,10 @@ class Analysis:
     def base(self) -> str:
         """The name of the first class; "" where the plan has none."""
         return next(iter(self.classes), "")
+
+    @functools.cached_property
+    def reference_costs(self) -> Costs:
+        return reference_costs(self.lives)
 
     @property
     def stream_algorithms(self) -> tuple[str, ...]:
@@ -143,10 +146,16 @@ class Analysis:
         tasks = RunKind(False, self.runs, self.classes, self.algorithms, metrics, "spec_digest")
         if not self.streams:
             return (tasks,)
-        lives = self.tables["stream_lives"]
-        lives = lives[lives.region == WITHIN].reset_index(drop=True)
+        lives = self.rows("stream_lives", region=WITHIN).reset_index(drop=True)
         algorithms, metrics = self.stream_algorithms, metrics_of("life")
         return tasks, RunKind(True, lives, self.streams, algorithms, metrics, "stream_digest")
+
+    def rows(self, table: str, **values: str) -> pd.DataFrame:
+        """The rows of a table that have these values."""
+        rows = self.tables[table]
+        for column, value in values.items():
+            rows = rows[rows[column] == value]
+        return rows
 
     def missing(self, *, streams: bool) -> pd.DataFrame:
         places = self.places

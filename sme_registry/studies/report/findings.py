@@ -125,13 +125,6 @@ def finding(
     return result | {"verdict": verdict, "sentence": sentence} | columns
 
 
-def _rows(table: pd.DataFrame, **values: str) -> list[Any]:
-    """The rows of a table that have these values, as named tuples."""
-    for column, value in values.items():
-        table = table[table[column] == value]
-    return list(table.itertuples())
-
-
 def _direction(row: Any) -> str:
     """`worse`, `better` or `open`, however few the pairs of a contrast are."""
     return change_verdict(row.change * METRICS[row.metric].worse, row.low, row.high)
@@ -145,7 +138,7 @@ def _task(analysis: Analysis, name: str) -> Found:
     """Which property of the task breaks a learner, and how sure that is."""
     place = {"algorithm": name, "metric": "wd_regret"}
     yield from _worst(analysis, name, "wd_regret")
-    for row in _rows(analysis.tables["levels"], class_name=analysis.base, **place):
+    for row in analysis.rows("levels", class_name=analysis.base, **place).itertuples():
         if row.iqm >= THRESHOLDS["unlearnt"]:
             yield finding(
                 "tasks", "first class", "unlearnt",
@@ -154,17 +147,17 @@ def _task(analysis: Analysis, name: str) -> Found:
                 "break, so the contrasts need a longer budget.",
                 row,
             )  # fmt: skip
-    contrasts = _rows(analysis.tables["contrasts"], **place)
     order = {
         "worse": "is higher", "better": "is lower", "open": "was shown neither higher nor lower"
     }  # fmt: skip
+    contrasts = analysis.rows("contrasts", **place).itertuples()
     by_change = sorted(contrasts, key=lambda row: -row.change)
-    contrasts = [
+    ordered = [
         *(row for row in by_change if _direction(row) == "worse"),
         *(row for row in reversed(by_change) if _direction(row) == "better"),
         *(row for row in by_change if _direction(row) == "open"),
     ]
-    largest = {row.axis or row.class_name: row for row in reversed(contrasts)}
+    largest = {row.axis or row.class_name: row for row in reversed(ordered)}
     for row in reversed(largest.values()):
         yield finding(
             "tasks", "axis", _of_few(_direction(row), row.pairs),
@@ -180,7 +173,7 @@ def _worst(analysis: Analysis, name: str, metric: str) -> Found:
     Without one, the largest fall.
     """
     regret = METRICS[metric].label
-    contrasts = _rows(analysis.tables["contrasts"], algorithm=name, metric=metric)
+    contrasts = [*analysis.rows("contrasts", algorithm=name, metric=metric).itertuples()]
     worse = [row for row in contrasts if _direction(row) == "worse"]
     better = [row for row in contrasts if _direction(row) == "better"]
     if not worse and better:
@@ -221,7 +214,7 @@ def _worst(analysis: Analysis, name: str, metric: str) -> Found:
 def _comparison(analysis: Analysis) -> Found:
     """The best learner over all classes among those with equal data, and how sure that is."""
     over_all = {"group": ALL, "metric": "wd_regret"}
-    rows = _rows(analysis.tables["aggregates"], **over_all, statistic="iqm")
+    rows = analysis.rows("aggregates", **over_all, statistic="iqm").itertuples()
     learners = [row for row in rows if row.algorithm in analysis.learners]
     data = training_data(analysis.runs)
     best: dict[str, Any] = {}
@@ -241,7 +234,7 @@ def _comparison(analysis: Analysis) -> Found:
             f"{_interval(row)}, where 0 is the optimum and 1 the constant ½.",
             row,
         )  # fmt: skip
-    for row in _rows(analysis.tables["improvements"], **over_all):
+    for row in analysis.rows("improvements", **over_all).itertuples():
         if {row.first, row.second} & {*best} and {row.first, row.second} <= {*analysis.learners}:
             yield finding(
                 "comparison", "improvement", _side(row, row.fewest_runs, 0.5),
@@ -274,7 +267,7 @@ def _offline(analysis: Analysis) -> Found:
 def _lives(analysis: Analysis) -> Found:
     """What each agent forgets in each stream, how its visits end, and what transfers."""
     for name in analysis.streams:
-        metrics = _rows(analysis.tables["stream_metrics"], class_name=name, region=WITHIN)
+        metrics = [*analysis.rows("stream_metrics", class_name=name, region=WITHIN).itertuples()]
         for key, does in _LIVES.items():
             of_metric = [row for row in metrics if row.metric == key]
             for row in sorted(of_metric, key=lambda row: -row.iqm):
@@ -294,8 +287,8 @@ def _lives(analysis: Analysis) -> Found:
 
 
 def _forgets_more(analysis: Analysis, name: str) -> Found:
-    rows = analysis.tables["stream_differences"]
-    for row in _rows(rows, class_name=name, metric="forgetting"):
+    rows = analysis.rows("stream_differences", class_name=name, metric="forgetting")
+    for row in rows.itertuples():
         verdict = _side(row, row.pairs, 0.0)
         text = f"Whether {row.first} or {row.second} forgets more is open"
         if verdict != "open":
@@ -310,8 +303,8 @@ def _changes(analysis: Analysis) -> Found:
     """What streams that differ from the first in their tasks alone change for each algorithm."""
     if not analysis.streams:
         return
-    rows = analysis.tables["stream_contrasts"]
-    rows = rows[(rows.axis == TASKS) & rows.metric.isin(_LIVES)]
+    rows = analysis.rows("stream_contrasts", axis=TASKS)
+    rows = rows[rows.metric.isin(_LIVES)]
     base = next(iter(analysis.streams.values()))
     for name, of_class in rows.groupby("class_name", sort=False):
         info = analysis.streams[name]

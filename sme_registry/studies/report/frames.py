@@ -185,22 +185,22 @@ def load(folder: str | os.PathLike[str]) -> StudyFrames:
       >>> sorted(results["algorithm"].unique())
       ['PPO', 'constant', 'linear']
     """
+    return study_frames(*_study(folder))
+
+
+def _study(folder: str | os.PathLike[str]) -> tuple[StudyPlan, dict[str, CellResult]]:
     ledger = Ledger(folder)
-    file = ledger.study_file()
-    return study_frames(file.plan, ledger.results(cell.cell.digest for cell in file.plan.cells))
+    plan = ledger.study_file().plan
+    return plan, ledger.results(cell.cell.digest for cell in plan.cells)
 
 
 def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFrames:
     """The frames of a plan's runs, from results by the digests of their cells."""
-    planned = [(cell, results.get(cell.cell.digest)) for cell in ordered(plan)]
-    finished = [
-        (cell, result, result.report)
-        for cell, result in planned
-        if result is not None and result.report is not None and not cell.in_stream
-    ]
-    rows = [row for run in finished for row in _result_rows(*run)]
-    evaluations = [row for cell, result, _ in finished for row in curve_rows(cell, result)]
-    agents = list(dict.fromkeys(name for *_, report in finished for name in report.agents))
+    runs = [run for run in finished_runs(plan, results) if not run[0].in_stream]
+    rows = [row for run in runs for row in _result_rows(*run)]
+    evaluations = [row for run in runs for row in _curve_rows(*run)]
+    reports = [result.report for _, result in runs if result.report is not None]
+    agents = list(dict.fromkeys(name for report in reports for name in report.agents))
     by_agent = " ".join(f" {column}/{name}" for column in AGENT_COLUMNS for name in agents)
     regrets = " ".join(f" regret/{name}" for name in agents)
     of_tasks = "".join(
@@ -225,12 +225,16 @@ def runs_of(results: pd.DataFrame) -> pd.DataFrame:
     return results.drop_duplicates(RUN)[of_run].reset_index(drop=True)
 
 
-def ordered(plan: StudyPlan) -> list[PlannedCell]:
-    """The plan's cells by class, then algorithm, then run; the plan itself has runs outermost."""
+def finished_runs(
+    plan: StudyPlan, results: Mapping[str, CellResult]
+) -> list[tuple[PlannedCell, CellResult]]:
+    """Those of the plan by class, then algorithm, then run; the plan itself has runs outermost."""
     names = [*(c.name for c in plan.classes), *(c.name for c in plan.streams)]
     classes = {name: i for i, name in enumerate(names)}
     algorithms = {algorithm.name: i for i, algorithm in enumerate(plan.algorithms)}
-    return sorted(plan.cells, key=lambda c: (classes[c.class_name], algorithms[c.algorithm], c.run))
+    cells = [cell for cell in plan.cells if cell.cell.digest in results]
+    cells.sort(key=lambda c: (classes[c.class_name], algorithms[c.algorithm], c.run))
+    return [(cell, results[cell.cell.digest]) for cell in cells]
 
 
 def frame(rows: Sequence[Any], columns: str) -> pd.DataFrame:
@@ -255,9 +259,9 @@ def window(evaluations: int) -> int:
     return min(_LONGEST_WINDOW, max(1, evaluations // 10))
 
 
-def _result_rows(
-    cell: PlannedCell, result: CellResult, report: EvaluationReport
-) -> Iterator[dict[str, Any]]:
+def _result_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
+    report = result.report
+    assert report is not None  # it is on a single task
     run = place(cell) | _run_columns(result, report)
     references = report.references
     for index, region in enumerate(report.regions):
@@ -277,7 +281,7 @@ def _result_rows(
         }
 
 
-def curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
+def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
     curve = result.curve
     columns = {
         "step": curve.steps,
@@ -380,19 +384,14 @@ def load_streams(folder: str | os.PathLike[str]) -> StreamFrames:
       >>> len(studies.load_streams("study").retention)  # a study without streams
       0
     """
-    ledger = Ledger(folder)
-    plan = ledger.study_file().plan
-    return stream_frames(
-        finished_lives(plan, ledger.results(cell.cell.digest for cell in plan.cells))
-    )
+    return stream_frames(finished_lives(*_study(folder)))
 
 
 def finished_lives(plan: StudyPlan, results: Mapping[str, CellResult]) -> list[FinishedLife]:
     """The finished lives, from results by the digests of their cells."""
     lives = []
-    for planned in ordered(plan):
-        result = results.get(planned.cell.digest)
-        if planned.phase is None and result is not None and result.stream_report is not None:
+    for planned, result in finished_runs(plan, results):
+        if result.stream_report is not None and planned.phase is None:
             fresh = sum(cell.digest in results for cell in planned.cell.fresh)
             lives.append(FinishedLife(planned, result, report_of_life(result, results), fresh))
     return lives
@@ -403,7 +402,7 @@ def stream_frames(lives: Sequence[FinishedLife]) -> StreamFrames:
         frame([row for life in lives for row in _life_rows(life)], _LIVES),
         frame([row for life in lives for row in _visit_rows(life)], _VISITS),
         frame([row for life in lives for row in _retention_rows(life)], _RETENTION),
-        frame([row for life in lives for row in curve_rows(life.planned, life.result)], CURVES),
+        frame([row for life in lives for row in _curve_rows(life.planned, life.result)], CURVES),
     )
 
 

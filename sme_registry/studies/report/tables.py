@@ -69,7 +69,6 @@ from sme_registry.studies.report.analysis import (
     by_place,
     change_verdict,
     counted,
-    reference_costs,
     summary,
     table,
     training_data,
@@ -88,8 +87,8 @@ from sme_registry.studies.report.frames import (
     RUN,
     RUN_COLUMNS,
     finished_lives,
+    finished_runs,
     frame,
-    ordered,
     place,
     runs_of,
     stream_frames,
@@ -149,7 +148,6 @@ def analyse(
         groups=groups(classes, names, set(by_place(runs))),
         runs=runs,
         lives=lives,
-        reference_costs=reference_costs(lives),
         tables={"results": results, "curves": curves}
         | {f"stream_{name}": rows for name, rows in life_frames.items()},
     )
@@ -314,11 +312,9 @@ def _levels(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 def _layers(analysis: Analysis) -> pd.DataFrame:
     rows = [
         place(planned) | probe.model_dump()
-        for planned in ordered(analysis.plan)
-        if (result := analysis.cells.get(planned.cell.digest)) is not None
-        and (report := result.report) is not None
-        and report.observation is not None
-        for probe in report.observation.probes
+        for planned, result in finished_runs(analysis.plan, analysis.cells)
+        if result.report is not None and result.report.observation is not None
+        for probe in result.report.observation.probes
     ]
     columns = f"{PLACE_COLUMNS} run:int64 layer:int64 units:int64 state_r2 distractor_r2"
     return layers(frame(rows, columns))

@@ -367,9 +367,9 @@ def _readable(analysis: Analysis) -> dict[str, pd.DataFrame]:
         tables["stream_metrics"] = pd.concat(
             [_of_lives(tables["stream_metrics"]), _of_lives(_references(analysis))]
         )
-        rows = tables["stream_matrices"][tables["stream_matrices"].region == WITHIN]
+        rows = _named(analysis.rows("stream_matrices", region=WITHIN))
         tables["stream_matrices"] = rows.assign(phase="phase " + rows.phase.astype(str))
-        rows = tables["stream_visit_metrics"][tables["stream_visit_metrics"].region == WITHIN]
+        rows = _named(analysis.rows("stream_visit_metrics", region=WITHIN))
         tables["stream_visit_metrics"] = rows[rows.metric.isin(_BY_VISIT)]
     return tables
 

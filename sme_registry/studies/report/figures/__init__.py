@@ -16,20 +16,7 @@ from sme_registry.plots.style import GREY, literal, new_figure, wrapped
 from sme_registry.studies.report.analysis import Analysis, by_place
 from sme_registry.studies.report.design import ALL, WITHIN, Metric, metrics_of
 from sme_registry.studies.report.figures import curves, panels
-from sme_registry.studies.report.figures.panels import (
-    FEW,
-    INDICATION,
-    WIDTH,
-    Drawn,
-    Picture,
-    dims,
-    epsilon_remark,
-    looks_of,
-    marks,
-    new_look,
-    panel_grid,
-    side_by_side,
-)
+from sme_registry.studies.report.figures.panels import FEW, INDICATION, Drawn, Picture
 from sme_registry.studies.report.frames import RUN
 
 if TYPE_CHECKING:
@@ -89,9 +76,8 @@ def draw_agents(analysis: Analysis) -> Drawn:
 
 
 def draw_aggregates(analysis: Analysis) -> Drawn:
-    rows = analysis.tables["aggregates"]
     yield from _forest(
-        analysis, rows[rows.statistic == "iqm"], "value", metrics_of("score"),
+        analysis, analysis.rows("aggregates", statistic="iqm"), "value", metrics_of("score"),
         "IQM of 1 − {label}", "group",
         name="aggregates",
         title="Aggregates over kinds of tasks",
@@ -102,8 +88,7 @@ def draw_aggregates(analysis: Analysis) -> Drawn:
 
 
 def draw_improvements(analysis: Analysis) -> Drawn:
-    rows = analysis.tables["improvements"]
-    rows = rows[rows.group == ALL]
+    rows = analysis.rows("improvements", group=ALL)
     yield from _forest(
         analysis, rows.assign(place=rows["first"] + " over " + rows["second"], algorithm=""),
         "probability", metrics_of("score"), "P(less {label})", "place", neutral=lambda _: 0.5,
@@ -116,8 +101,8 @@ def draw_improvements(analysis: Analysis) -> Drawn:
 
 
 def draw_differences(analysis: Analysis) -> Drawn:
-    first, rows = analysis.algorithms[0], analysis.tables["differences"]
-    rows = rows[rows["first"] == first]
+    first = analysis.algorithms[0]
+    rows = analysis.rows("differences", first=first)
     yield from _forest(
         analysis, rows.assign(algorithm=rows.second), "difference", metrics_of("score"),
         f"{literal(first)} − the other:\n{{label}}\n(left: {literal(first)} is better)",
@@ -131,10 +116,10 @@ def draw_differences(analysis: Analysis) -> Drawn:
 
 
 def draw_lives(analysis: Analysis) -> Drawn:
-    rows = analysis.tables["stream_metrics"]
+    rows = analysis.rows("stream_metrics", region=WITHIN)
     shown = [metric for metric in metrics_of("life") if metric.key in _OF_LIVES]
     yield from _forest(
-        analysis, rows[rows.region == WITHIN], "iqm", shown, "{label}\n({worse} is worse)",
+        analysis, rows, "iqm", shown, "{label}\n({worse} is worse)",
         neutral=lambda metric: metric.neutral, share_x=False,
         name="stream-metrics",
         title="Performance, forgetting and plasticity of whole lives",
@@ -163,14 +148,11 @@ def _forest(
     if rows.empty:
         return
     places = _places(analysis, rows, place)
-    looks = looks_of(analysis, rows.algorithm) or {"": new_look("black", "o")}
+    rows = rows.assign(at=rows[place].map(places))
+    looks = panels.looks_of(analysis, rows.algorithm) or {"": panels.new_look("black", "o")}
 
     def draw_metric(axes: Axes, metric: Metric) -> None:
-        of_metric = rows[rows.metric == metric.key]
-        at = of_metric[place].map(places)
-        for algorithm, look, shift in side_by_side(looks, 0.7):
-            selected = of_metric.algorithm == algorithm
-            marks(axes, of_metric[selected], value, at[selected] + shift, look)
+        panels.marks(axes, rows[rows.metric == metric.key], value, looks, 0.7)
         if neutral is not None:
             axes.axvline(neutral(metric), color="black", linewidth=0.9, zorder=1.5)
         for y in places.values():
@@ -179,14 +161,14 @@ def _forest(
         axes.tick_params(axis="y", length=0)
         axes.locator_params(axis="x", nbins=5)
         text = label.format(label=metric.label, worse="right" if metric.worse > 0 else "left")
-        lines = (wrapped(line, 0.9 * WIDTH / len(metrics)) for line in text.splitlines())
+        lines = (wrapped(line, 0.9 * panels.WIDTH / len(metrics)) for line in text.splitlines())
         axes.set_xlabel("\n".join(lines))
 
     highest = max(places.values())
     labels = [wrapped(literal(text), _LABELS) for text in places]
     more = max(text.count("\n") for text in labels)
     height = 1.6 + (0.09 * len(looks) + 0.12) * max(4.0, highest + 1) + 0.13 * more * len(labels)
-    figure = panel_grid(
+    figure = panels.grid(
         [("", metric) for metric in metrics], draw_metric, (0.0, height),
         looks={algorithm: look for algorithm, look in looks.items() if algorithm},
         across=len(metrics), share_x=share_x,
@@ -225,18 +207,17 @@ def draw_regions(analysis: Analysis) -> Drawn:
         axes.set_yticks(range(len(classes)), classes, fontsize=8)
 
     items = [(name, name) for name in analysis.algorithms]
-    figure = panel_grid(items, draw_map, (0.75, 0.62 + 0.2 * len(classes)))
-    panels.colour_bar(
-        figure, figure.axes[0].images[0],
-        "similarity r̃ (IQM over runs) in WD and in the shells OOD 1, 2, …; "
+    figure = panels.grid(
+        items, draw_map, (0.75, 0.62 + 0.2 * len(classes)),
+        bar="similarity r̃ (IQM over runs) in WD and in the shells OOD 1, 2, …; "
         + maps.scale_text(scale),
-        maps.scale_ticks(scale),
+        ticks=maps.scale_ticks(scale),
     )  # fmt: skip
     yield Picture(
         "regions",
         "Similarity within and out of distribution",
         "IQM over runs of r̃, 1 for the optimum, in the unit cube (WD) and in each shell around "
-        f"it. A dash: no run has finished.{epsilon_remark(analysis)}",
+        f"it. A dash: no run has finished.{panels.epsilon_remark(analysis)}",
         figure,
         is_map=True,
     )
@@ -248,7 +229,7 @@ def draw_decay(analysis: Analysis) -> Drawn:
     loss = outside.similarity_loss.to_numpy()
     figure = new_figure((4.8, 3.5))
     axes = figure.add_subplot()
-    for name, look in looks_of(analysis).items():
+    for name, look in panels.looks_of(analysis).items():
         selected = (inside.algorithm == name).to_numpy()
         mark = {**look, "linestyle": "none", "markersize": 4, "alpha": 0.55}
         edge = 0.8 if look["marker"] in "x+12" else 0.0
@@ -263,15 +244,15 @@ def draw_decay(analysis: Analysis) -> Drawn:
         "the outermost shell. Below 0 a run is better outside, which an agent can be whose actions "
         "saturate before it has learnt."
     )
-    state_dims = dims(analysis)
+    state_dims = panels.dims(analysis)
     if len(state_dims) > 1:
         caption += f" It includes runs with S = {', '.join(map(str, state_dims))}."
-        caption += epsilon_remark(analysis)
+        caption += panels.epsilon_remark(analysis)
     yield Picture("decay", "Similarity lost outside against similarity inside", caption, figure)
 
 
 def draw_maps(analysis: Analysis) -> Drawn:
-    inside = analysis.tables["results"][analysis.tables["results"].region == "WD"]
+    inside = analysis.rows("results", region=WITHIN)
     single = [name for name, info in analysis.classes.items() if info.setting["team"] == "none"]
     plane = inside[(inside.state_dim == 2) & inside.class_name.isin(single)]
     kept, problem = _kept_maps(analysis, plane[plane.key.isin(analysis.models)])
@@ -288,10 +269,10 @@ def draw_maps(analysis: Analysis) -> Drawn:
         axes.set_yticks([0, 1])
 
     items = [(f"{algorithm} on {name}", item) for (name, algorithm), item in kept.items()]
-    width = min(WIDTH, 1.4 + 2.0 * len(items))
-    figure = panel_grid(items, draw_map, (0.5, 2.1), width=width, share_x=True)
-    label = f"similarity r̃; {maps.scale_text(scale)}"
-    panels.colour_bar(figure, figure.axes[0].images[0], label, maps.scale_ticks(scale))
+    figure = panels.grid(
+        items, draw_map, (0.5, 2.1), width=min(panels.WIDTH, 1.4 + 2.0 * len(items)), share_x=True,
+        bar=f"similarity r̃; {maps.scale_text(scale)}", ticks=maps.scale_ticks(scale),
+    )  # fmt: skip
     yield Picture(
         "maps",
         "Similarity over the plane, beyond the unit square",

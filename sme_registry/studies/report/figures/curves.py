@@ -29,49 +29,33 @@ from sme_registry.studies.report.design import (
     setting_label,
 )
 from sme_registry.studies.report.figures import panels
-from sme_registry.studies.report.figures.panels import (
-    CONSTANT,
-    FEW,
-    INDICATION,
-    LINEAR,
-    WIDTH,
-    Drawn,
-    Look,
-    Picture,
-    curves_caption,
-    epsilon_remark,
-    looks_of,
-    marks,
-    new_look,
-    panel_grid,
-    side_by_side,
-)
+from sme_registry.studies.report.figures.panels import FEW, INDICATION, Drawn, Look, Picture
 from sme_registry.studies.report.texts import slug
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_BEHAVIOUR, _OPTIMUM = new_look("black"), new_look(GREY, dash=(0, (1, 1.2)))
+_BEHAVIOUR, _OPTIMUM = panels.new_look("black"), panels.new_look(GREY, dash=(0, (1, 1.2)))
 _HEIGHTS = 0.9, 2.3  # inches: of the rest, and of a row of panels
 _PAD = 14.0  # points between panels and titles, for the phases
 OVER_LIVES = (
     "IQM over lives with its 95 % bootstrap interval, within distribution. "
-    f"{panels.FEW} lives, {panels.INDICATION}"
+    f"{FEW} lives, {INDICATION}"
 )
 _BESIDE = {  # a life, in the colour of its algorithm: label, look, caption
     "fresh": (
-        "fresh agents", new_look(GREY, dash=(0, (5, 1.2, 1, 1.2))),
+        "fresh agents", panels.new_look(GREY, dash=(0, (5, 1.2, 1, 1.2))),
         " Dash-dotted, in the colour of the algorithm: agents that start anew in each visit, "
         "spread evenly over it. A life below that line has less regret than fresh agents.",
     ),
     "frozen": (
-        LABELS["frozen_agent"], new_look(GREY, dash=(0, (2.5, 1.2))),
+        LABELS["frozen_agent"], panels.new_look(GREY, dash=(0, (2.5, 1.2))),
         " Dashed, in the colour of the algorithm: the same agents if they stop learning after "
         "visit 0. A life above that line lost by learning on.",
     ),
 }  # fmt: skip
-_REFERENCES = {"frozen_optimum": new_look(GREY, dash=(0, (1, 1.2))), "constant": CONSTANT}
+_REFERENCES = {"frozen_optimum": _OPTIMUM, "constant": panels.CONSTANT}
 
 
 def draw_regret(analysis: Analysis) -> Drawn:
@@ -80,7 +64,7 @@ def draw_regret(analysis: Analysis) -> Drawn:
         "IQM over runs with its 95 % bootstrap interval: 0 is the optimum, 1 the constant action "
         f"½, the dashed line the linear least-squares policy fitted to the optimum. {FEW} runs."
     )
-    remark, groups = epsilon_remark(analysis), _axis_groups(analysis)
+    remark, groups = panels.epsilon_remark(analysis), _axis_groups(analysis)
     metrics = metrics_of("score")
     if len(groups) == 1 and groups[0].axis not in ("", SEVERAL):
         (group,) = groups
@@ -105,12 +89,12 @@ def draw_regret(analysis: Analysis) -> Drawn:
 def _regret_panels(
     analysis: Analysis, items: Sequence[tuple[str, Group, str]], x: str = ""
 ) -> Figure:
-    looks = looks_of(analysis, analysis.learners or analysis.algorithms)
-    figure = panel_grid(
+    looks = panels.looks_of(analysis, analysis.learners or analysis.algorithms)
+    figure = panels.grid(
         [(title, (group, metric)) for title, group, metric in items],
         lambda axes, item: _draw_axis(axes, analysis, *item, looks), (0.9, 2.3),
         x=x, y="normalised regret",
-        looks={**looks, "linear (LSQ)": LINEAR, "constant ½": CONSTANT},
+        looks={**looks, "linear (LSQ)": panels.LINEAR, "constant ½": panels.CONSTANT},
     )  # fmt: skip
     # From 0, with headroom in proportion. Last: it ends autoscaling, for all panels.
     first = figure.axes[0]
@@ -129,21 +113,19 @@ def _draw_axis(
     labels = [literal(label) for label in _class_labels(group)]
     distance = panels.tick_classes(axes, places, labels, nominal=kind == "nominal")
     x = dict(zip(group.classes, places, strict=True))
-    levels = analysis.tables["levels"]
-    levels = levels[(levels.metric == metric) & levels.class_name.isin(x)]
+    levels = analysis.rows("levels", metric=metric)
+    levels = levels[levels.class_name.isin(x)]
     levels = levels.assign(at=levels.class_name.map(x)).sort_values("at", kind="stable")
     linear = levels.drop_duplicates("class_name", keep="last")
-    look = LINEAR if group.axis not in ("", SEVERAL) else new_look(GREY, "_", "none")
+    look = panels.LINEAR if group.axis not in ("", SEVERAL) else panels.new_look(GREY, "_", "none")
     axes.plot(linear["at"], linear.linear, **look, linewidth=1.2, markersize=14, zorder=1.6)
-    axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=CONSTANT["linestyle"], zorder=1.6)
-    for name, look, shift in side_by_side(looks, 0.5 * distance):
-        rows = levels[levels.algorithm == name]
-        joined = kind != "nominal"
-        marks(axes, rows, "iqm", rows["at"] + shift, look, upright=True, joined=joined)
+    axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=panels.CONSTANT["linestyle"], zorder=1.6)
+    joined = kind != "nominal"
+    panels.marks(axes, levels, "iqm", looks, 0.5 * distance, upright=True, joined=joined)
 
 
 def draw_profiles(analysis: Analysis) -> Drawn:
-    looks = looks_of(analysis)
+    looks = panels.looks_of(analysis)
 
     def draw_group(axes: Axes, rows: pd.DataFrame) -> None:
         for name, profile in rows.groupby("algorithm", sort=False):
@@ -154,11 +136,10 @@ def draw_profiles(analysis: Analysis) -> Drawn:
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
 
     for metric in metrics_of("score"):
-        rows = analysis.tables["profiles"]
-        rows = rows[rows.metric == metric.key]
+        rows = analysis.rows("profiles", metric=metric.key)
         if rows.empty:
             continue
-        figure = panel_grid(
+        figure = panels.grid(
             panels.by(rows, "group"), draw_group, (0.7, 2.1), x=f"τ (1 − {metric.label})",
             y="share of runs above τ", looks=looks, share_x=True,
         )  # fmt: skip
@@ -172,9 +153,9 @@ def draw_profiles(analysis: Analysis) -> Drawn:
 
 
 def draw_class_curves(analysis: Analysis) -> Drawn:
-    rows = analysis.tables["learning_curves"]
-    rows = rows[(rows.measure == "regret") & rows.algorithm.isin(analysis.learners)]
-    looks = looks_of(analysis, rows.algorithm)
+    rows = analysis.rows("learning_curves", measure="regret")
+    rows = rows[rows.algorithm.isin(analysis.learners)]
+    looks = panels.looks_of(analysis, rows.algorithm)
     if len(looks) < 2:
         return
 
@@ -189,17 +170,16 @@ def draw_class_curves(analysis: Analysis) -> Drawn:
     yield Picture(
         "learning-curves-by-class",
         "Learning curves of all algorithms by class",
-        f"{curves_caption(rows)} Mean exact regret per step, 0 for the optimum.",
-        panel_grid(items, draw_class, (0.8, 1.9), x="steps", y=CURVES["regret"], looks=looks),
+        f"{panels.curves_caption(rows)} Mean exact regret per step, 0 for the optimum.",
+        panels.grid(items, draw_class, (0.8, 1.9), x="steps", y=CURVES["regret"], looks=looks),
     )
 
 
 def draw_lifetime_curves(analysis: Analysis) -> Drawn:
-    rows = analysis.tables["stream_learning_curves"]
-    rows = rows[rows.measure == "regret"]
+    rows = analysis.rows("stream_learning_curves", measure="regret")
     if rows.empty:
         return
-    looks = looks_of(analysis, rows.algorithm)
+    looks = panels.looks_of(analysis, rows.algorithm)
 
     def draw_stream(axes: Axes, of_stream: pd.DataFrame) -> None:
         panels.draw_lines(axes, of_stream, "algorithm", looks)
@@ -208,9 +188,9 @@ def draw_lifetime_curves(analysis: Analysis) -> Drawn:
     yield Picture(
         "stream-learning-curves",
         "Learning curves of lives",
-        f"{curves_caption(rows)} Mean exact regret per step in evaluations during training, on the "
-        "task in force. Shades and numbers above are visits and their phases.",
-        panel_grid(
+        f"{panels.curves_caption(rows)} Mean exact regret per step in evaluations during training, "
+        "on the task in force. Shades and numbers above are visits and their phases.",
+        panels.grid(
             panels.by(rows, "class_name"), draw_stream, _HEIGHTS, x="lifetime (steps)",
             y=CURVES["regret"], looks=looks, title_pad=_PAD,
         ),
@@ -225,8 +205,8 @@ def draw_learning_curves(analysis: Analysis) -> Drawn:
             yield Picture(
                 f"learning-curves-{re.sub('[ .]', '-', group.axis or group.name).lower()}",
                 f"Learning curves: {group.name}",
-                f"{curves_caption(rows)} Left: return in % of the optimum's. Right: mean exact "
-                "regret per step, 0 for the optimum.",
+                f"{panels.curves_caption(rows)} Left: return in % of the optimum's. Right: mean "
+                "exact regret per step, 0 for the optimum.",
                 _group_curves(analysis, group, rows),
             )
 
@@ -250,7 +230,7 @@ def _group_curves(analysis: Analysis, group: Group, rows: pd.DataFrame) -> Figur
     ]
     labels = _class_labels(group, with_symbol=True)
     named = dict(zip(labels, looks.values(), strict=True))
-    return panel_grid(items, draw_curve, (0.6, 2.2), looks=named, across=2, share_y="col")
+    return panels.grid(items, draw_curve, (0.6, 2.2), looks=named, across=2, share_y="col")
 
 
 def draw_offline(analysis: Analysis) -> Drawn:
@@ -258,13 +238,14 @@ def draw_offline(analysis: Analysis) -> Drawn:
     if rows.empty:
         return
     looks = panels.numbered_looks(dict.fromkeys(rows.learner))
-    references = {"behaviour policy": _BEHAVIOUR, "optimum": _OPTIMUM, "constant ½": CONSTANT}
+    known = _BEHAVIOUR, _OPTIMUM, panels.CONSTANT
+    references = dict(zip(("behaviour policy", "optimum", "constant ½"), known, strict=True))
     across = min(3, rows.class_name.nunique())
-    figure = panel_grid(
+    figure = panels.grid(
         panels.by(rows, "class_name"),
         lambda axes, of_class: _draw_improvements(axes, analysis, of_class, looks),
         (0.9, 2.4), x="ν of the behaviour policy", y="r̃ − r̃ of the behaviour",
-        looks={**looks, **references}, width=max(3.6, min(WIDTH, 1.0 + 2.4 * across)),
+        looks={**looks, **references}, width=max(3.6, min(panels.WIDTH, 1.0 + 2.4 * across)),
         share_x=True,
     )  # fmt: skip
     yield Picture(
@@ -282,14 +263,15 @@ def _draw_improvements(
 ) -> None:
     data = rows.drop_duplicates("nu")
     axes.axhline(0.0, color="black", linewidth=0.9, zorder=1.5)
-    for look, similarity in ((_OPTIMUM, 1.0), (CONSTANT, data.constant_similarity)):
+    for look, similarity in ((_OPTIMUM, 1.0), (panels.CONSTANT, data.constant_similarity)):
         height = similarity - data.behaviour_similarity
         axes.plot(data.nu, height, **look, linewidth=1.1, zorder=1.6)
     nus = sorted(set(analysis.tables["offline"].nu))
     apart = min((b - a for a, b in itertools.pairwise(nus)), default=1.0)
-    for name, look, shift in side_by_side(looks, 0.25 * apart):
-        means = rows[rows.learner == name]
-        marks(axes, means, "improvement", means.nu + shift, look, upright=True, joined=True)
+    panels.marks(
+        axes, rows, "improvement", looks, 0.25 * apart,
+        of="learner", at="nu", upright=True, joined=True,
+    )  # fmt: skip
 
 
 def _axis_groups(analysis: Analysis) -> Sequence[Group]:
@@ -305,12 +287,12 @@ def _class_labels(group: Group, *, with_symbol: bool = False) -> list[str]:
 
 
 def draw_dynamic_regret(analysis: Analysis) -> Drawn:
-    regret, references = (analysis.tables[f"stream_{n}"] for n in ("regret", "reference_regret"))
+    regret = analysis.tables["stream_regret"]
     if regret.empty:
         return
     looks = {
         name: {**look, "linestyle": "-"}
-        for name, look in looks_of(analysis, regret.algorithm).items()
+        for name, look in panels.looks_of(analysis, regret.algorithm).items()
     }
 
     def draw_stream(axes: Axes, rows: pd.DataFrame) -> None:
@@ -321,16 +303,18 @@ def draw_dynamic_regret(analysis: Analysis) -> Drawn:
                 style = {**beside, "color": look["color"]}
                 axes.plot(curve.lifetime, curve[column], **style, linewidth=1.1, zorder=2.5)
         panels.draw_lines(axes, rows, "algorithm", looks, "lifetime")
-        for reference, curve in references[references.class_name == name].groupby("reference"):
+        references = analysis.rows("stream_reference_regret", class_name=name)
+        for reference, curve in references.groupby("reference"):
             line = _REFERENCES[str(reference)]
             axes.plot(curve.lifetime, curve["median"], **line, linewidth=1.1, zorder=1.5)
         _finish_lifetime(axes, analysis, name)
         axes.yaxis.set_major_formatter(panels.step_text)
 
     beside = [_BESIDE[column] for column in _BESIDE if regret[column].notna().any()]
-    drawn = {LABELS[n]: look for n, look in _REFERENCES.items() if n in set(references.reference)}
+    known = set(analysis.tables["stream_reference_regret"].reference)
+    drawn = {LABELS[name]: look for name, look in _REFERENCES.items() if name in known}
     named = {**looks, **{label: look for label, look, _ in beside}, **drawn}
-    figure = panel_grid(
+    figure = panels.grid(
         panels.by(regret, "class_name"), draw_stream, _HEIGHTS, x="lifetime (steps)",
         y="dynamic regret  (Σ of 1 − r)", looks=named, title_pad=_PAD,
     )  # fmt: skip
@@ -343,20 +327,17 @@ def draw_dynamic_regret(analysis: Analysis) -> Drawn:
 
 
 def draw_plasticity(analysis: Analysis) -> Drawn:
-    rows = analysis.tables["stream_visit_metrics"]
-    rows = rows[(rows.region == WITHIN) & (rows.metric == "plasticity_ratio")]
+    rows = analysis.rows("stream_visit_metrics", region=WITHIN, metric="plasticity_ratio")
     if rows.empty:
         return
-    looks = looks_of(analysis, rows.algorithm)
+    looks = panels.looks_of(analysis, rows.algorithm)
 
     def draw_stream(axes: Axes, of_stream: pd.DataFrame) -> None:
-        for algorithm, look, shift in side_by_side(looks, 0.4):
-            lives = of_stream[of_stream.algorithm == algorithm]
-            marks(axes, lives, "iqm", lives.visit + shift, look, upright=True, joined=True)
+        panels.marks(axes, of_stream, "iqm", looks, 0.4, at="visit", upright=True, joined=True)
         axes.axhline(1.0, color="black", linewidth=0.9, zorder=1.5)
         tick_visits(axes, _visits(analysis, of_stream.class_name.iloc[0]))
 
-    figure = panel_grid(
+    figure = panels.grid(
         panels.by(rows, "class_name"), draw_stream, _HEIGHTS, x="visit of phase",
         y="plasticity ratio", looks=looks,
     )  # fmt: skip
@@ -371,8 +352,7 @@ def draw_plasticity(analysis: Analysis) -> Drawn:
 
 
 def draw_retention(analysis: Analysis) -> Drawn:
-    matrices = analysis.tables["stream_matrices"]
-    for name, rows in panels.by(matrices[matrices.region == WITHIN], "class_name"):
+    for name, rows in panels.by(analysis.rows("stream_matrices", region=WITHIN), "class_name"):
         yield Picture(
             f"stream-retention-{slug(name)}",
             f"Retention in {name}",
@@ -396,13 +376,10 @@ def _retention(rows: pd.DataFrame, visits: Sequence[Visit]) -> Figure:
         draw_matrix(axes, M, labels, phases, (0.0, top), visited, "viridis_r")
 
     height = 0.55 + 0.24 * max(4, min(len(labels), 30))
-    figure = panel_grid(
+    return panels.grid(
         panels.by(rows, "algorithm"), draw_agent, (1.0, height), x="on the task of phase",
-        y="policy at the end of", share_x=True,
+        y="policy at the end of", share_x=True, bar=MATRIX_SCALE.replace("\n", " "),
     )  # fmt: skip
-    label = MATRIX_SCALE.replace("\n", " ")
-    panels.colour_bar(figure, figure.axes[0].images[0], label)
-    return figure
 
 
 def draw_performance(analysis: Analysis) -> Drawn:
@@ -411,7 +388,7 @@ def draw_performance(analysis: Analysis) -> Drawn:
         of_stream = reports.setdefault(life.planned.class_name, {})
         of_stream.setdefault(life.planned.algorithm, []).append(life.report)
     for name, of_stream in reports.items():
-        figure = panel_grid(
+        figure = panels.grid(
             of_stream.items(), lambda axes, of_agent: performance_curve(of_agent, ax=axes),
             (0.9, 2.4), x="visit of phase", y="performance", share_x=True,
         )  # fmt: skip

@@ -86,7 +86,7 @@ def numbered_looks(names: Iterable[str]) -> dict[str, Look]:
     return {name: new_look(*look) for name, look in zip(names, looks, strict=False)}
 
 
-def panel_grid(
+def grid(
     items: Iterable[tuple[str, Item]],
     draw: Callable[[Axes, Item], Any],
     heights: tuple[float, float],
@@ -99,20 +99,24 @@ def panel_grid(
     share_x: bool = False,
     share_y: bool | Literal["col"] = True,
     title_pad: float | None = None,
+    bar: str = "",
+    ticks: Any = None,
 ) -> Figure:
     """A figure with a titled panel for each item, and a legend of the looks below them.
 
     `heights` are those of the rest and of a row of panels. `x` and `y` are labels outside alone.
+    With `bar`, a label, the colours of the first panel's map are below, with `ticks`.
     """
     titles, values = zip(*items, strict=True)
     across = min(across, len(values))
     down = math.ceil(len(values) / across)
     figure = new_figure((width, heights[0] + down * heights[1]))
-    grid = figure.subplots(down, across, squeeze=False, sharex=share_x, sharey=share_y).ravel()
-    for unused in grid[len(values) :]:
+    panels = figure.subplots(down, across, squeeze=False, sharex=share_x, sharey=share_y).ravel()
+    used = list(panels[: len(values)])
+    for unused in panels[len(values) :]:
         unused.set_visible(False)
     lines = 1
-    for index, (axes, title, value) in enumerate(zip(grid, titles, values, strict=False)):
+    for index, (axes, title, value) in enumerate(zip(used, titles, values, strict=True)):
         draw(axes, value)
         lowest = index + across >= len(values)
         if share_x:
@@ -128,6 +132,10 @@ def panel_grid(
     figure.set_figheight(figure.get_figheight() + _LINE * (lines - 1) * down)
     if looks:
         legend(figure, looks)
+    if bar:
+        place: Any = {"location": "bottom", "shrink": 0.5, "aspect": 40, "pad": 0.02}
+        colours = figure.colorbar(used[0].images[0], ax=used, label=bar, ticks=ticks, **place)
+        colours.outline.set_visible(False)
     return figure
 
 
@@ -136,7 +144,7 @@ def by(rows: pd.DataFrame, column: str) -> list[tuple[str, pd.DataFrame]]:
     return [(str(name), group) for name, group in rows.groupby(column, sort=False)]
 
 
-def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
+def legend(figure: Figure, looks: Mapping[str, Look]) -> None:
     first = figure.axes[0]
     handles = [
         first.plot([], [], label=literal(name), markersize=4.5, linewidth=1.4, **look)[0]
@@ -145,7 +153,7 @@ def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
     if any(map(_has_hollow_marks, figure.axes)):
         hollow: Any = {"marker": "o", "linestyle": "none", "color": GREY, "markersize": 4.5}
         handles += first.plot([], [], markerfacecolor="white", label=FEW.lower(), **hollow)
-    legend_below(figure, handles, across)
+    legend_below(figure, handles)
 
 
 def _has_hollow_marks(axes: Axes) -> bool:
@@ -153,13 +161,6 @@ def _has_hollow_marks(axes: Axes) -> bool:
     return any(
         line.get_markerfacecolor() == "white" and np.size(line.get_xdata()) for line in axes.lines
     )
-
-
-def colour_bar(figure: Figure, image: Any, label: str, ticks: Any = None) -> None:
-    panels = [axes for axes in figure.axes if axes.get_visible()]
-    place: Any = {"location": "bottom", "shrink": 0.5, "aspect": 40, "pad": 0.02}
-    bar = figure.colorbar(image, ax=panels, label=label, ticks=ticks, **place)
-    bar.outline.set_visible(False)
 
 
 def side_by_side(looks: Mapping[str, Look], spread: float) -> Iterator[tuple[str, Look, float]]:
@@ -172,30 +173,36 @@ def marks(
     axes: Axes,
     rows: pd.DataFrame,
     value: str,
-    at: Any,
-    look: Look,
+    looks: Mapping[str, Look],
+    spread: float,
     *,
+    of: str = "algorithm",
+    at: str = "at",
     upright: bool = False,
     joined: bool = False,
 ) -> None:
-    """Marks of the column `value` along x, or y if `upright`, with intervals from `low` to `high`.
+    """Marks of the column `value`, side by side at their place `at`, by the names in `of`.
 
-    They are hollow where a row rests on fewer than `ENOUGH_RUNS` runs, lives or pairs.
+    They are along x, or y if `upright`, with intervals from `low` to `high`, and hollow where a row
+    rests on fewer than `ENOUGH_RUNS` runs, lives or pairs.
     """
-    x, y = (at, rows[value]) if upright else (rows[value], at)
-    if "enough_pairs" in rows:
-        enough = rows.enough_pairs
-    else:
-        enough = rows["fewest_runs" if "fewest_runs" in rows else "runs"] >= ENOUGH_RUNS
-    colour, known = look["color"], rows.low.notna()
-    if joined:
-        axes.plot(x, y, **{**look, "marker": ""}, linewidth=1.1, alpha=0.7)
-    if known.any():
-        draw_interval = axes.vlines if upright else axes.hlines
-        draw_interval(at[known], rows.low[known], rows.high[known], color=colour, linewidth=1.4)
-    style = {**look, "linestyle": "none", "markersize": 4.5, "markeredgewidth": 1.1}
-    for selected, face in ((enough, colour), (~enough, "white")):
-        axes.plot(x[selected], y[selected], markerfacecolor=face, **style, zorder=3)
+    for name, look, shift in side_by_side(looks, spread):
+        own = rows[rows[of] == name]
+        place = own[at] + shift
+        x, y = (place, own[value]) if upright else (own[value], place)
+        if "enough_pairs" in own:
+            enough = own.enough_pairs
+        else:
+            enough = own["fewest_runs" if "fewest_runs" in own else "runs"] >= ENOUGH_RUNS
+        colour, known = look["color"], own.low.notna()
+        if joined:
+            axes.plot(x, y, **{**look, "marker": ""}, linewidth=1.1, alpha=0.7)
+        if known.any():
+            interval = axes.vlines if upright else axes.hlines
+            interval(place[known], own.low[known], own.high[known], color=colour, linewidth=1.4)
+        style = {**look, "linestyle": "none", "markersize": 4.5, "markeredgewidth": 1.1}
+        for selected, face in ((enough, colour), (~enough, "white")):
+            axes.plot(x[selected], y[selected], markerfacecolor=face, **style, zorder=3)
 
 
 def draw_lines(
