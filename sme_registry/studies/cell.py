@@ -11,7 +11,6 @@ The same cell gives the same result on the same machine, except for `timing`.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +30,10 @@ from sme_registry.studies.result import (
     TRAINING,
     CellFailure,
     CellResult,
-    LearningCurve,
     OfflineCell,
     Outcome,
     Record,
+    Report,
     SharedProgram,
     Timing,
     life_report,
@@ -45,14 +44,9 @@ from sme_registry.training.algorithms import Entry, check_hyperparameters, find,
 from sme_registry.training.learn import Learner, Run, Steps, Watch
 from sme_registry.training.record import Snapshots
 
-ReportSteps = Callable[[int, int], None]
-
-TRANSITIONS = 50_000
-BATCH_SIZE = 256
-
 
 def run_cell(
-    cell: Cell, progress: ReportSteps | None = None, model_path: Path | None = None
+    cell: Cell, progress: Report | None = None, model_path: Path | None = None
 ) -> CellResult:
     """Train, evaluate during training, and evaluate in and out of distribution at the end.
 
@@ -77,13 +71,13 @@ def run_cell(
         return _run_alone(cell, progress, model_path)
     with entry.surroundings():
         if entry.kind == "offline":
-            return _run_offline(cell, entry.name, progress)
+            return _run_offline(cell, entry, progress)
         if entry.kind == "reference":
             return _run_reference(cell, entry.name, progress)
         return _train(cell, entry, progress, model_path)
 
 
-def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | None) -> CellResult:
+def _train(cell: Cell, entry: Entry, progress: Report, model_path: Path | None) -> CellResult:
     run = Run(
         document=cell.document,
         seed=cell.seed,
@@ -106,7 +100,7 @@ def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | N
     return training.result()
 
 
-def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
+def _run_alone(cell: Cell, progress: Report, model_path: Path | None) -> CellResult:
     run_program = imported("sme_registry.studies.programs:run_program")
     outcome: Outcome
     (outcome,) = run_program((cell,), SharedProgram(1), progress, model_path is not None)
@@ -120,7 +114,7 @@ def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> Ce
     return entry
 
 
-def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
+def _run_reference(cell: Cell, name: str, progress: Report) -> CellResult:
     evaluations = _Evaluations(cell, progress, cell.evaluations)
     policy = as_policy(reference_policy(name, cell.spec), cell.spec)
     for steps in evaluations.record.due:
@@ -132,7 +126,7 @@ def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
 class _Evaluations(Watch):
     """The evaluations of a cell whose policy runs outside JAX."""
 
-    def __init__(self, cell: Cell, progress: ReportSteps, evaluations: int) -> None:
+    def __init__(self, cell: Cell, progress: Report, evaluations: int) -> None:
         self.cell, self._progress = cell, progress
         tasks = materialize_segments(cell.document)
         self._schedule = Schedule(cell.document, tasks)
@@ -181,7 +175,7 @@ class _Training(_Evaluations):
     """A learner and its evaluations; in a stream also its policies at the ends of visits."""
 
     def __init__(
-        self, cell: Cell, progress: ReportSteps, learner: Learner, snapshots: Path | None
+        self, cell: Cell, progress: Report, learner: Learner, snapshots: Path | None
     ) -> None:
         n = min(1, cell.evaluations) if learner.only_at_the_end else cell.evaluations
         super().__init__(cell, progress, n)
@@ -237,19 +231,21 @@ class _Training(_Evaluations):
             self.evaluate(steps, self._learner.policy())
 
 
-def _run_offline(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
+def _run_offline(cell: Cell, entry: Entry, progress: Report) -> CellResult:
     """Collect the data, learn from it, and evaluate the policy as in every cell."""
     start = time.thread_time()
     settings: dict[str, Any] = dict(cell.hyperparameters)
-    nu: Any = settings.get("nu")
-    recipe = _recipe(cell, settings)
-    data = collect(recipe, materialize(cell.spec), {})
+    fields = entry.settings().model_fields
+    nu, transitions, batch_size = (
+        settings.pop(name, fields[name].default) for name in ("nu", "transitions", "batch_size")
+    )
+    data = collect(_recipe(cell, nu, transitions), materialize(cell.spec), {})
     collected = time.thread_time()
     result = train_offline(
         data,
-        algorithm=name,
+        algorithm=entry.name,
         steps=cell.steps,
-        batch_size=settings.pop("batch_size", BATCH_SIZE),
+        batch_size=batch_size,
         seed=cell.seed,
         evaluations=max(1, cell.evaluations),
         episodes=cell.evaluation_episodes,
@@ -259,49 +255,39 @@ def _run_offline(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
         progress=lambda done, total, _: progress(done, total),
     )
     end = time.thread_time()
-    record, T = result.record, cell.spec.horizon
-    evaluations = record.evaluations
-    training = record.cpu_ms_per_step * cell.steps / 1e3
-    return CellResult(
-        key=cell.digest,
-        cell=cell,
-        curve=LearningCurve(
-            steps=tuple(each.step for each in evaluations),
-            episode_return=tuple(each.episode_return for each in evaluations),
-            regret=tuple(1.0 - each.episode_return / T for each in evaluations),
-            similarity=tuple(each.similarity for each in evaluations),
-            length=(float(T),) * len(evaluations),
-        ),
-        report=result.report,
-        offline=OfflineCell(
-            nu=nu,
-            transitions=recipe.transitions,
-            dataset_digest=record.dataset_digest,
-            behaviour_similarity=record.behaviour.similarity,
-            behaviour_similarity_sd=record.behaviour.similarity_sd,
-            similarity=record.similarity,
-            similarity_sd=evaluations[-1].similarity_sd,
-        ),
-        timing=Timing(
-            total=end - start,
-            training=training,
-            environment=collected - start,
-            evaluation=max(0.0, end - collected - training),
-            steps_per_second=cell.steps / max(training, 1e-9),
-        ),
-        versions=record.versions,
+    learned, T = result.record, cell.spec.horizon
+    record = Record((cell,), 1, len(learned.evaluations), time.thread_time)
+    for k, each in enumerate(learned.evaluations):
+        row = each.step, each.episode_return, 1.0 - each.episode_return / T, each.similarity, T
+        record.evaluation(k, np.array(row)[:, None])
+    training = learned.cpu_ms_per_step * cell.steps / 1e3
+    timing = Timing(
+        total=end - start,
+        training=training,
+        environment=collected - start,
+        evaluation=max(0.0, end - collected - training),
+        steps_per_second=cell.steps / max(training, 1e-9),
     )
+    offline = OfflineCell(
+        nu=nu,
+        transitions=transitions,
+        dataset_digest=learned.dataset_digest,
+        behaviour_similarity=learned.behaviour.similarity,
+        behaviour_similarity_sd=learned.behaviour.similarity_sd,
+        similarity=learned.similarity,
+        similarity_sd=learned.evaluations[-1].similarity_sd,
+    )
+    return record.result(0, 0, result.report, timing, offline=offline)
 
 
-def _recipe(cell: Cell, settings: dict[str, Any]) -> DatasetRecipe:
-    """The recipe of a cell's data set; takes its `nu` and `transitions` out of `settings`."""
+def _recipe(cell: Cell, nu: float, transitions: int) -> DatasetRecipe:
     if cell.spec.D > 0:
         raise SpecError(f"D={cell.spec.D:g}: must be 0 for an offline cell. Leave it out.")
     return DatasetRecipe.from_dict(
         {
             "spec": cell.spec,
-            "behaviours": [{"kind": "mixture", "nu": settings.pop("nu"), "weight": 1.0}],
-            "transitions": settings.pop("transitions", TRANSITIONS),
+            "behaviours": [{"kind": "mixture", "nu": nu, "weight": 1.0}],
+            "transitions": transitions,
             "seed": cell.seed,
             "protocol": cell.protocol,
         },

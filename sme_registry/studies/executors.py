@@ -41,7 +41,7 @@ from sme_registry.studies.cell import run_cell
 from sme_registry.studies.result import CPU, CellResult, Job, Outcome, Report, failed
 from sme_registry.training.algorithms import imported
 
-RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
+RunCell = Callable[[Cell, Report | None, Path | None], CellResult]
 ReportProgress = Callable[[Job, int, int], None]  # called with the steps done, and those in all
 Jobs = Iterator[Job | None]
 

@@ -48,8 +48,8 @@ CELLS, FAILED, LOCKS, REPORT = "cells", "failed", "locks", "report"
 STATE_FILES = "states"  # of programs that run, or were killed
 _STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS_OF_STUDY, REPORT, STATE_FILES}
 
-
 _Entry = TypeVar("_Entry", CellResult, CellFailure)
+_FOLDERS: dict[type[Any], str] = {CellResult: CELLS, CellFailure: FAILED}
 
 
 class Ledger:
@@ -103,13 +103,13 @@ class Ledger:
 
     def results(self, keys: Iterable[str] | None = None) -> dict[str, CellResult]:
         """Results by key: of all files in the folder, or of these keys, in their order."""
-        return self._read(CellResult, CELLS, keys)
+        return self._read(CellResult, keys)
 
     def failure(self, key: str) -> CellFailure | None:
         return self.failures([key]).get(key)
 
     def failures(self, keys: Iterable[str] | None = None) -> dict[str, CellFailure]:
-        return self._read(CellFailure, FAILED, keys)
+        return self._read(CellFailure, keys)
 
     def write(
         self,
@@ -118,17 +118,14 @@ class Ledger:
         snapshots: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
         """Write a cell's result or failure, completely or not at all."""
-        if isinstance(entry, CellFailure):
-            entry.write(self.failure_path(entry.key))
-            return
         # Models first: a kill in between must not leave a result without them.
         for name, snapshot in snapshots.items():
             write_atomically(self.snapshots_path(entry.key) / name, snapshot)
         if model is not None:
             write_atomically(self.model_path(entry.key), model)
-        entry.write(self._path(CELLS, entry.key))
-        with contextlib.suppress(FileNotFoundError):
-            self.failure_path(entry.key).unlink()
+        entry.write(self._path(type(entry), entry.key))
+        if isinstance(entry, CellResult):
+            self.failure_path(entry.key).unlink(missing_ok=True)
 
     def model_path(self, key: str) -> Path:
         return model_of_cell(self.folder, key)
@@ -138,7 +135,7 @@ class Ledger:
         return folder_of_cell(self.folder, key)
 
     def failure_path(self, key: str) -> Path:
-        return self._path(FAILED, key)
+        return self._path(CellFailure, key)
 
     def lock(self, key: str) -> Lock | None:
         """Acquire a cell's lock; None if any process, including this one, holds it already."""
@@ -171,7 +168,7 @@ class Ledger:
         """Remove the states of which every cell has a result: a retry goes on from the others."""
         for path in self._states():
             keys = read_header(path).get("cells", [])
-            if all(self._path(CELLS, key).exists() for key in keys):
+            if all(self._path(CellResult, key).exists() for key in keys):
                 path.unlink(missing_ok=True)
 
     def _states(self) -> list[Path]:
@@ -179,11 +176,8 @@ class Ledger:
 
     def set_aside(self, key: str) -> None:
         """Rename a cell's result or failure if it is invalid. The caller must hold the lock."""
-        kinds: dict[type[Any], Path] = {
-            CellResult: self._path(CELLS, key),
-            CellFailure: self.failure_path(key),
-        }
-        for kind, path in kinds.items():
+        for kind in _FOLDERS:
+            path = self._path(kind, key)
             if not path.exists():
                 continue
             try:
@@ -193,18 +187,17 @@ class Ledger:
                 path.replace(aside)
                 self.warn(f"{error} Renamed to {aside.name}; the cell runs again.")
 
-    def _path(self, folder: str, key: str) -> Path:
-        return self.folder / folder / f"{_hex(key)}.json"
+    def _path(self, kind: type[Any], key: str) -> Path:
+        return self.folder / _FOLDERS[kind] / f"{_hex(key)}.json"
 
-    def _read(
-        self, kind: type[_Entry], folder: str, keys: Iterable[str] | None
-    ) -> dict[str, _Entry]:
+    def _read(self, kind: type[_Entry], keys: Iterable[str] | None) -> dict[str, _Entry]:
         if keys is None:
-            keys = (f"sha256:{p.stem}" for p in sorted((self.folder / folder).glob("*.json")))
+            files = sorted((self.folder / _FOLDERS[kind]).glob("*.json"))
+            keys = (f"sha256:{path.stem}" for path in files)
         entries = {}
         for key in keys:
             with contextlib.suppress(SMEError):
-                entries[key] = _read_entry(kind, self._path(folder, key), key)
+                entries[key] = _read_entry(kind, self._path(kind, key), key)
         return entries
 
 

@@ -66,14 +66,10 @@ class Programs:
     """Which cells of a plan share a program, and how many runs it has."""
 
     def __init__(
-        self,
-        cells: Iterable[Cell],
-        platform: str = CPU,
-        device: str | None = None,
-        most_runs: int | None = None,
+        self, cells: Iterable[Cell], device: str | None = None, most_runs: int | None = None
     ) -> None:
-        self.platform, self._device = platform, device
-        self._most = most_runs or (_MOST_RUNS if platform == CPU else _MOST_RUNS_ELSEWHERE)
+        self.platform, self._device = platform_of(device), device
+        self._most = most_runs or (_MOST_RUNS if self.platform == CPU else _MOST_RUNS_ELSEWHERE)
         self._cells = {cell.digest: cell for cell in cells if backend_of(cell.uses).in_programs}
         self._sizes: dict[Hashable, int] = defaultdict(int)
         for cell in self._cells.values():

@@ -20,7 +20,7 @@ from sme_registry.studies.budget import selected, with_sources
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.executors import Executor, RunCell, executor_type
 from sme_registry.studies.ledger import Ledger, StudyStatus, label, plan_status
-from sme_registry.studies.result import CPU, CellFailure, CellResult, Job, Outcome
+from sme_registry.studies.result import CPU, CellFailure, CellResult, Job, Outcome, SharedProgram
 from sme_registry.training.algorithms import (
     backend_of,
     check_algorithms,
@@ -131,11 +131,9 @@ def _programs(
             f"device={device!r}: must be cpu on a cluster, where a program has one core. Leave out "
             "--device, or use --executor processes on a machine that has such a device."
         )
-    device = device if local else CPU
-    module = "sme_registry.studies.programs"
-    platform = imported(f"{module}:platform_of")(device)
     cells = (cell.cell for cell in plan.cells)
-    programs: Programs = imported(f"{module}:Programs")(cells, platform, device, lanes)
+    new_programs = imported("sme_registry.studies.programs:Programs")
+    programs: Programs = new_programs(cells, device if local else CPU, lanes)
     return programs
 
 
@@ -201,35 +199,30 @@ class Queue:
 
     def _next_job(self) -> Job | None:
         """Claim the next cells that still have to run; None if there are none to claim now."""
-        jobs = (running.job for running in self._running.values())
-        occupied = any(self._has_the_device(job.cells[0]) for job in jobs)
+        running = (self._programs_of(running.job.cells[0]) for running in self._running.values())
+        occupied = any(programs is not None and programs.one_at_a_time for programs in running)
         for key, place in list(self.waiting.items()):
-            if occupied and self._has_the_device(place.cell):
-                continue
-            if self._programs is not None and backend_of(place.cell.uses).in_programs:
-                job = self._claim_program(self._programs, key)
+            programs = self._programs_of(place.cell)
+            if programs is None:
+                job = self._claim_job([key])
+            elif not (occupied and programs.one_at_a_time):
+                job = self._claim_program(programs, key)
             else:
-                lock = self._claim(key)
-                job = None if lock is None else self._started(Job((place.cell,)), [lock])
+                continue
             if job is not None:
                 return job
         return None
 
-    def _has_the_device(self, cell: Cell) -> bool:
-        """Whether a cell's program has the device to itself."""
-        programs = self._programs
-        alone = programs is not None and programs.one_at_a_time
-        return alone and backend_of(cell.uses).in_programs
+    def _programs_of(self, cell: Cell) -> Programs | None:
+        """Those of which a cell is a run; None if it runs by itself."""
+        return self._programs if backend_of(cell.uses).in_programs else None
 
     def _claim_program(self, programs: Programs, first: str) -> Job | None:
         """Claim a cell and the others of its program: those of a saved state, or the next ones."""
-        if self._ledger.is_running(first):
-            return None
-        claiming = self._ledger.claim_lock()
+        claiming = None if self._ledger.is_running(first) else self._ledger.claim_lock()
         if claiming is None:
             return None
-        with claiming, contextlib.ExitStack() as stack:  # releases all of them if one raises
-            cells, locks = list[Cell](), list[Lock]()
+        with claiming:
             program = programs.program(self.planned[first].cell)
             path, keys = self._ledger.state_of(first, program.build_key) or (None, [])
             in_state = programs.cells(keys)
@@ -241,17 +234,28 @@ class Queue:
                 for key in (keys if path else self.waiting)
                 if key in self.waiting and programs.group(self.planned[key].cell) == group
             ]
-            for key in sorted(candidates, key=lambda key: key != first):  # which leads
-                if len(cells) < program.runs and (lock := self._claim(key)) is not None:
-                    locks.append(stack.enter_context(lock))
-                    cells.append(self.planned[key].cell)
-                if not cells:
+            candidates.sort(key=lambda key: key != first)  # which leads
+            return self._claim_job(candidates, replace(program, state=path, cells=in_state))
+
+    def _claim_job(self, keys: Sequence[str], program: SharedProgram | None = None) -> Job | None:
+        """Lock the first of these cells, and of the others as many as its program has runs."""
+        locks: dict[str, Lock] = {}
+        with contextlib.ExitStack() as stack:  # releases all of them if one raises
+            for key in keys:
+                if (lock := self._claim(key)) is not None:
+                    locks[key] = stack.enter_context(lock)
+                if not locks:
                     return None
-            if path is None:
-                path = self._ledger.state_path([cell.digest for cell in cells], program.build_key)
-            program = replace(program, state=path, cells=in_state)
+                if program is not None and len(locks) == program.runs:
+                    break
+            if program is not None and program.state is None:
+                program = replace(program, state=self._ledger.state_path(locks, program.build_key))
             stack.pop_all()
-        return self._started(Job(tuple(cells), program), locks)
+        job = Job(tuple(self.planned[key].cell for key in locks), program)
+        for key, lock in locks.items():
+            del self.waiting[key]
+            self._running[key] = _RunningCell(lock, job)
+        return job
 
     def _claim(self, key: str) -> Lock | None:
         """Lock a waiting cell; None if another process holds it, or has run it."""
@@ -268,12 +272,6 @@ class Queue:
         del self.waiting[key]
         self._count(entry)
         return None
-
-    def _started(self, job: Job, locks: Sequence[Lock]) -> Job:
-        for cell, lock in zip(job.cells, locks, strict=True):
-            del self.waiting[cell.digest]
-            self._running[cell.digest] = _RunningCell(lock, job)
-        return job
 
 
 class _StudyRun:
