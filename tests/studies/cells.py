@@ -1,17 +1,25 @@
 """Plans of small cells, and work for them that waits, fails or dies as a test wants it."""
 
+import io
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
 
+from rich.console import Console
+
 from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec.study import Cell
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger
+from sme_registry.studies.runner import run_study
 
+ROOT = Path(__file__).resolve().parents[2]
 PROTOCOL = {"states_per_region": 2, "epsilons": [1.0]}
 STARTED, GATE = "started", "gate"
 
@@ -37,6 +45,34 @@ def small_file(seeds=2, algorithms=("constant",), **fields):
         "protocol": PROTOCOL,
     } | fields
     return file_of("small", **fields)
+
+
+def cell_of(**fields):
+    """A cell with these fields, and others for a short run."""
+    defaults = {
+        "hyperparameters": {}, "action_range": "symmetric", "seed": 3, "evaluation_episodes": 3,
+        "protocol": {"states_per_region": 50, "epsilons": [1.0]},
+    }  # fmt: skip
+    return Cell(**defaults | fields)
+
+
+def quick(file, folder, **options):
+    """Run a plan in this process; its status, and the output."""
+    output = io.StringIO()
+    options = {"executor": "in-process", "console": Console(file=output, width=200)} | options
+    return run_study(file, folder, **options), output.getvalue()
+
+
+def python(source, *arguments):
+    """Run this source in another process, which finds our packages."""
+    return subprocess.run(
+        [sys.executable, "-c", source, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        timeout=300,
+    )
 
 
 def noted(folder, cell, progress=None, model_path=None):

@@ -4,6 +4,7 @@ import dataclasses
 
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger
+from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.result import CellFailure
 from tests.studies.cells import file_of
@@ -67,6 +68,18 @@ def analysed(folder, leave_out=lambda planned: False, draws=300):
     results = {key: result for key, result in ledger.results().items() if key not in gone}
     errors = {key: failure.error for key, failure in ledger.failures().items()}
     return analyse(file, results, errors, draws=draws)
+
+
+def rows_of(table, **values):
+    """The rows of a table that have these values."""
+    for name, value in values.items():
+        table = table[table[name] == value]
+    return table
+
+
+def found(analysis, **at):
+    """The findings with these values, by question."""
+    return {row.question: row for row in rows_of(findings(analysis), **at).itertuples()}
 
 
 def with_tables(analysis, **tables):

@@ -10,7 +10,6 @@ from sme_registry.envs import SMEEnv
 from sme_registry.envs.episodes import info_of_envs
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.spec.document import StrictModel
-from sme_registry.spec.study import Cell
 from sme_registry.studies import run_cell
 from sme_registry.training import train
 from sme_registry.training.algorithms import (
@@ -22,6 +21,7 @@ from sme_registry.training.algorithms import (
 )
 from sme_registry.training.learn import Learner, Steps
 from sme_registry.training.models import new_model
+from tests.studies.cells import cell_of
 
 sb3 = pytest.importorskip("stable_baselines3")
 
@@ -160,14 +160,10 @@ def test_a_back_end_is_a_module_and_a_row_for_training_and_for_studies(tmp_path,
         names=("centre",),
     )
     monkeypatch.setitem(BACKENDS, "constant", row)
-    fields = {
-        "spec": SPEC, "uses": "constant:centre", "hyperparameters": {}, "seed": 3, "steps": 40,
-        "action_range": "symmetric", "evaluations": 2, "evaluation_episodes": 2,
-        "protocol": {"states_per_region": 50},
-    }  # fmt: skip
-    result, reference = (run_cell(Cell(**fields | {"uses": uses})) for uses in (
-        "constant:centre", "reference:constant"
-    ))  # fmt: skip
+    result, reference = (
+        run_cell(cell_of(spec=SPEC, uses=uses, steps=40, evaluations=2))
+        for uses in ("constant:centre", "reference:constant")
+    )
     assert result.curve.to_dict() == reference.curve.to_dict()
     assert 0.0 < result.online_regret < 1.0
     options = {"steps": 40, "protocol": {"states_per_region": 50}, "progress": False}

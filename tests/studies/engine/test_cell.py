@@ -16,27 +16,20 @@ from sme_registry.errors import (
     SpecError,
 )
 from sme_registry.spec import EvaluationProtocol
-from sme_registry.spec.study import Cell
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.result import CellResult
 from sme_registry.task import materialize
+from tests.studies.cells import cell_of
 
 SPEC = SMESpec(state_dim=2, action_dim=2, horizon=20)
 
 
 def cell(uses="TD3", **changes):
     fields = {
-        "spec": SPEC,
-        "uses": uses,
-        "hyperparameters": {},
-        "action_range": "symmetric",
-        "seed": 3,
-        "steps": 130,
-        "evaluations": 4,
-        "evaluation_episodes": 3,
+        "spec": SPEC, "uses": uses, "steps": 130, "evaluations": 4,
         "protocol": {"states_per_region": 100},
-    }
-    return Cell(**{**fields, **changes})
+    }  # fmt: skip
+    return cell_of(**fields | changes)
 
 
 def without_timing(result):
@@ -229,12 +222,11 @@ OFFLINE_PROTOCOL = EvaluationProtocol(states_per_region=50)
 
 
 def offline(uses="offline:bc", spec=None, **hyperparameters):
-    return Cell(
+    return cell_of(
         spec=spec or SMESpec(state_dim=2, action_dim=1, seed=1),
         uses=uses,
         hyperparameters={"nu": 0.5, "transitions": 1000, **hyperparameters},
         action_range="unit",
-        seed=3,
         steps=60,
         evaluations=2,
         evaluation_episodes=2,

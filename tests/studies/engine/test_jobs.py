@@ -1,17 +1,15 @@
 """Which cells are runs of one program, and how a run claims them beside others."""
 
 import contextlib
-import io
 
 import pytest
-from rich.console import Console
 
 from sme_registry.errors import OptionError
 from sme_registry.studies.executors import InProcess
 from sme_registry.studies.ledger import Ledger, write_state
 from sme_registry.studies.result import failed
 from sme_registry.studies.runner import run_study
-from tests.studies.cells import file_of
+from tests.studies.cells import file_of, quick
 
 pytest.importorskip("jax")
 
@@ -70,15 +68,13 @@ def claimed(file, study, **options):
     """The jobs of a run, those of a program first."""
     hooks = {name: options.pop(name, None) for name in ("meanwhile", "while_waiting")}
     executor = Refusing(**hooks)
-    run_study(
-        file, study, executor=executor, console=Console(file=io.StringIO()), device="cpu", **options
-    )
+    quick(file, study, executor=executor, device="cpu", **options)
     return sorted(executor.jobs, key=lambda job: job.program is None)
 
 
 def test_cells_of_one_shape_and_kind_of_reward_share_a_program_and_others_do_not():
     file = plan_file()
-    programs = Programs(cells(file))
+    programs = Programs(cells(file), "cpu")
     small, gated, delayed = (cells(file, name)[0] for name in ("small", "gated", "delayed"))
     assert programs.group(small) == programs.group(gated) == programs.group(cells(file, "small")[2])
     assert programs.group(small) != programs.group(delayed)
@@ -102,7 +98,7 @@ def test_cells_of_one_shape_and_kind_of_reward_share_a_program_and_others_do_not
 @pytest.mark.parametrize(("seeds", "most", "runs"), [(5, 10, 10), (13, 10, 9)])
 def test_the_programs_of_a_group_have_equally_many_runs_at_most_the_limit(seeds, most, runs):
     file = plan_file(seeds)
-    programs = Programs(cells(file), most_runs=most)
+    programs = Programs(cells(file), "cpu", most)
     assert {programs.runs(cell) for cell in cells(file, "small", "gated")} == {runs}
 
 
@@ -179,7 +175,7 @@ def test_a_saved_state_decides_which_cells_go_on_together(tmp_path):
     of_group = cells(file, "small", "gated")
     ledger = Ledger(tmp_path)
     keys = [of_group[i].digest for i in (6, 0, 3)]
-    build_key = Programs(cells(file)).program(of_group[0]).build_key
+    build_key = Programs(cells(file), "cpu").program(of_group[0]).build_key
     saved = ledger.state_path(keys)
     assert saved != ledger.state_path(keys, build_key)  # others leave it as it is
     write_state(saved, {"cells": keys, **build_key}, {})

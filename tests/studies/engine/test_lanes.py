@@ -1,17 +1,12 @@
 """Cells that use JAX: as in `run_cell`, in one program, resumed with the same bits."""
 
-import io
-import os
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from sme_registry.evaluation import evaluate
 from sme_registry.studies.cell import run_cell
@@ -22,8 +17,7 @@ from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.report.texts import implementation_caveats
 from sme_registry.studies.report.write import page
 from sme_registry.studies.result import CellResult
-from sme_registry.studies.runner import run_study
-from tests.studies.cells import file_of, numbers
+from tests.studies.cells import ROOT, file_of, numbers, python, quick
 
 pytest.importorskip("jax")
 pytest.importorskip("stable_baselines3")
@@ -32,7 +26,6 @@ from sme_registry.studies import programs
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
-ROOT = Path(__file__).resolve().parents[3]
 STEPS = 96
 
 # Kills itself after the first of three rollouts, when its state has been written.
@@ -46,19 +39,18 @@ test_lanes.ran(sys.argv[1], on_steps=lambda done: os.kill(os.getpid(), signal.SI
 """
 
 
-def plan_file(uses="jax:PPO", **fields):
+def plan_file(**fields):
     """Two seeds on two classes of one group, and a reference."""
     small = {"state_dim": 2, "action_dim": 2, "horizon": 20}
-    settings = {"policy_kwargs": {"net_arch": [8, 8]}} | (
-        {"n_steps": 32, "batch_size": 16, "n_epochs": 2} if "PPO" in uses else {"batch_size": 16}
-    )
+    settings = {"n_steps": 32, "batch_size": 16, "n_epochs": 2}
+    settings["policy_kwargs"] = {"net_arch": [8, 8]}
     fields = {
         "classes": [
             {"name": "small", "setting": small, "seeds": [1, 2]},
             {"name": "gated", "setting": small | {"r_min": 0.5}, "seeds": [1, 2]},
         ],
         "algorithms": [
-            {"name": "agent", "uses": uses, "hyperparameters": settings},
+            {"name": "agent", "uses": "jax:PPO", "hyperparameters": settings},
             {"name": "linear", "uses": "reference:linear", "steps": 0},
         ],
         "seeds": 2,
@@ -86,19 +78,11 @@ class Watched(InProcess):
         return super().map(jobs, report)
 
 
-def ran(study, file=None, **options):
+def ran(study, *, on_steps=lambda done: None, keep_models=False, **options):
     """The status of a run in this process, of agents alone."""
-    on_steps = options.pop("on_steps", lambda done: None)
-    keep = options.pop("keep_models", False)
-    options = {"only": ["algorithm=agent"], "device": "cpu"} | options
-    return run_study(
-        file or plan_file(),
-        study,
-        executor=options.pop("executor", Watched(keep_models=keep, on_steps=on_steps)),
-        console=options.pop("console", Console(file=io.StringIO())),
-        keep_models=keep,
-        **options,
-    )
+    executor = Watched(keep_models=keep_models, on_steps=on_steps)
+    options = {"executor": executor, "only": ["algorithm=agent"], "device": "cpu"} | options
+    return quick(plan_file(), study, **options)[0]
 
 
 @pytest.fixture(scope="module")
@@ -163,13 +147,7 @@ def test_a_kept_model_is_one_of_stable_baselines3_and_scores_the_same(whole):
 
 
 def test_after_kill_9_a_program_goes_on_from_its_state_with_the_same_bits(whole, tmp_path):
-    process = subprocess.run(
-        [sys.executable, "-c", KILLED, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
+    process = python(KILLED, tmp_path)
     assert process.returncode == -signal.SIGKILL, process.stderr
     ledger = Ledger(tmp_path)
     (state,) = (tmp_path / "states").glob("*.npz")

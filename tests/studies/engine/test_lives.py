@@ -1,23 +1,19 @@
 """Cells that are lives in streams: the policies of their visits, their regret, their files."""
 
-import io
 import json
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from sme_registry import SMESpec, StreamSpec, materialize
 from sme_registry.errors import PolicyError, SMEError, SpecError
 from sme_registry.evaluation import evaluate_stream, expected_regret
-from sme_registry.spec.study import Cell
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger, label, study_status
 from sme_registry.studies.result import CellResult
-from sme_registry.studies.runner import run_study
 from sme_registry.training.algorithms import find
 from sme_registry.training.record import Snapshots
-from tests.studies.cells import file_of, numbers
+from tests.studies.cells import cell_of, file_of, numbers, quick
 
 pytest.importorskip("stable_baselines3")
 
@@ -36,18 +32,10 @@ TWICE = stream_of(TASK, OTHER, cycles=2)
 
 def life(stream=TWICE, uses="PPO", **changes):
     fields = {
-        "spec": stream.phases[0].spec,
-        "stream": stream,
-        "uses": uses,
-        "hyperparameters": SMALL if "PPO" in uses else {},
-        "action_range": "symmetric",
-        "seed": 3,
-        "steps": stream.steps,
-        "evaluations": 8,
-        "evaluation_episodes": 3,
-        "protocol": PROTOCOL,
-    }
-    return Cell(**{**fields, **changes})
+        "spec": stream.phases[0].spec, "stream": stream, "steps": stream.steps, "uses": uses,
+        "hyperparameters": SMALL if "PPO" in uses else {}, "evaluations": 8,
+    }  # fmt: skip
+    return cell_of(**fields | changes)
 
 
 def plan_file(uses="PPO", **fields):
@@ -213,14 +201,8 @@ def test_a_phase_that_goes_on_to_the_end_of_an_episode_gets_its_regret():
 def studied(tmp_path_factory):
     """A study of lives that has been run, with its models."""
     study = tmp_path_factory.mktemp("study")
-    ran(study, plan_file(), keep_models=True)
+    quick(plan_file(), study, keep_models=True)
     return study
-
-
-def ran(study, file, **options):
-    console = Console(file=io.StringIO(), width=200)
-    options = {"executor": "in-process", "console": console, **options}
-    return run_study(file, study, **options)
 
 
 def test_fresh_agents_that_two_streams_share_run_once_and_count_once(studied):
@@ -263,7 +245,7 @@ def test_a_stream_that_agents_in_jax_cannot_live_in_is_refused_before_anything_r
     find("PPO").check_task(stream)
     file = plan_file("jax:PPO", streams=[{"name": "one", "stream": stream.to_dict()}])
     with pytest.raises(SMEError, match=message):
-        ran(tmp_path / "study", file, device="cpu")
+        quick(file, tmp_path / "study", device="cpu")
     assert not (tmp_path / "study").exists()
 
 
@@ -287,7 +269,7 @@ def test_lives_that_switch_at_the_same_steps_are_runs_of_one_program():
         life(stream_of(TASK, steps=64), "jax:PPO"),
         life(stream_of(TASK, steps=64), "jax:PPO").fresh[0],
     ]
-    programs = Programs([base, *same, *others])
+    programs = Programs([base, *same, *others], "cpu")
     group = programs.group(base)
     assert [programs.group(cell) == group for cell in same] == [True] * 2
     assert len({programs.group(cell) for cell in (base, *others)}) == 1 + len(others)
@@ -325,15 +307,15 @@ def visits(monkeypatch):
 @pytest.mark.usefixtures("quickly_compiled")
 def test_interrupted_lives_in_jax_go_on_with_the_weights_of_their_visits(tmp_path, visits):
     whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"
-    ran(whole, jax_file(), device="cpu", keep_models=True)
+    quick(jax_file(), whole, device="cpu", keep_models=True)
     ended, raised = visits
     raised.append(KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
-        ran(interrupted, jax_file(), device="cpu")
+        quick(jax_file(), interrupted, device="cpu")
     assert not Ledger(interrupted).results()
     assert list((interrupted / "states").glob("*.npz"))
     ended.clear()
-    assert ran(interrupted, jax_file(), device="cpu").count("done") == 6
+    assert quick(jax_file(), interrupted, device="cpu")[0].count("done") == 6
     assert ended == [1]  # visit 0 had been saved
     assert numbers(interrupted) == numbers(whole)
     lives = [result for result in Ledger(whole).results().values() if result.cell.stream]
@@ -355,9 +337,9 @@ def test_models_that_are_asked_for_after_an_interruption_make_lives_in_jax_start
     ended, raised = visits
     raised.append(KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
-        ran(tmp_path, jax_file(), device="cpu")
+        quick(jax_file(), tmp_path, device="cpu")
     ended.clear()
-    assert ran(tmp_path, jax_file(), device="cpu", keep_models=True).count("done") == 6
+    assert quick(jax_file(), tmp_path, device="cpu", keep_models=True)[0].count("done") == 6
     assert ended == [0, 1]  # a model needs more than was saved
     folders = [Ledger(tmp_path).snapshots_path(key) for key in Ledger(tmp_path).results()]
     assert sorted(len(list(folder.glob("*"))) for folder in folders) == [0] * 4 + [3] * 2

@@ -1,22 +1,14 @@
 """Cells as tasks of Ray. Nearly all of the time here is Ray's own: 15 to 30 s for each start."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 from sme_registry.errors import OptionError
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.runner import run_study
 from tests.studies import cells
-from tests.studies.cells import small_file
+from tests.studies.cells import python, small_file
 
 pytest.importorskip("ray")
-
-ROOT = Path(__file__).resolve().parents[3]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 # In a process of its own: Ray leaves handles to the garbage collector, and threads to whoever is
 # next. Two nodes on this machine; the larger one is removed as soon as cells fill both.
@@ -55,14 +47,7 @@ cluster.shutdown()
 def test_when_a_node_is_lost_its_cells_run_again_and_every_cell_has_one_result(tmp_path):
     study, notes = tmp_path / "study", tmp_path / "notes"
     notes.mkdir()
-    process = subprocess.run(
-        [sys.executable, "-c", LOST_NODE, str(study), str(notes)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=ENVIRONMENT,
-        timeout=300,
-    )
+    process = python(LOST_NODE, study, notes)
     assert process.returncode == 0, process.stderr
     keys = {planned.cell.digest for planned in small_file(seeds=6).plan.cells}
     assert set(Ledger(study).results()) == keys
@@ -77,15 +62,8 @@ def test_a_local_cluster_is_started_quietly_and_ends_with_the_command(tmp_path):
     plan, study = tmp_path / "plan.json", tmp_path / "study"
     file = small_file(seeds=2, algorithms=["constant", {"name": "bad", "uses": "math:sqrt"}])
     file.write(plan)
-    sme = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
-    process = subprocess.run(
-        [*sme, "study", "run", str(plan), "-f", str(study), "--ray", "local", "--jobs", "1"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=ENVIRONMENT,
-        timeout=300,
-    )
+    command = ("study", "run", plan, "-f", study, "--ray", "local", "--jobs", "1")
+    process = python("from sme_registry.cli import main; main()", *command)
     assert process.returncode == 1, process.stderr
     assert len(Ledger(study).results()) == 2
     assert len(Ledger(study).failures()) == 2

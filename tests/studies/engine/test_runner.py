@@ -19,12 +19,9 @@ from rich.console import Console
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.studies.ledger import Ledger, study_status
 from sme_registry.studies.result import CellFailure
-from sme_registry.studies.runner import run_study
 from tests.commands import sme
 from tests.studies import cells
-from tests.studies.cells import small_file
-
-ROOT = Path(__file__).resolve().parents[3]
+from tests.studies.cells import ROOT, python, quick, small_file
 
 DRIVER = """
 import sys
@@ -87,13 +84,6 @@ def _path(monkeypatch):
 @pytest.fixture
 def study(tmp_path):
     return tmp_path / "study"
-
-
-def quick(file, folder, **options):
-    """Run in this process; the status, and the output."""
-    output = io.StringIO()
-    options = {"executor": "in-process", "console": Console(file=output, width=200)} | options
-    return run_study(file, folder, **options), output.getvalue()
 
 
 def driver(study, notes, seeds, open_for=0):
@@ -285,10 +275,8 @@ def test_on_a_full_disk_it_stops_with_a_typed_error_and_loses_nothing(study, tmp
     small.write(plan)
     quick(small_file(seeds=1), study)
     before = {path: path.read_bytes() for path in (study / "cells").iterdir()}
-    command = [sys.executable, "-c", FULL_DISK, "study", "run", str(plan), "-f", str(study)]
-    process = subprocess.run(
-        [*command, "--executor", "in-process"], capture_output=True, text=True, check=False
-    )
+    command = ("study", "run", plan, "-f", study, "--executor", "in-process")
+    process = python(FULL_DISK, *command)
     assert process.returncode == 2, process.stderr
     assert process.stderr.splitlines()[-1].startswith("error: ")
     assert "cannot be written: File too large" in process.stderr

@@ -15,6 +15,7 @@ from sme_registry.studies.report.frames import study_frames
 from sme_registry.studies.report.tables import analyse, layers
 from sme_registry.studies.report.write import compare
 from tests.studies.cells import small_file
+from tests.studies.finished import rows_of
 
 FIELDS = {
     "plain": {},
@@ -121,11 +122,8 @@ def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
         and result.report.safety is not None
         and result.cell.uses == "reference:linear"
     ]
-    (row,) = (
-        analysis.tables["levels"]
-        .query("class_name == 'safe' and algorithm == 'linear' and metric == 'wd_cost'")
-        .itertuples()
-    )
+    at = {"class_name": "safe", "algorithm": "linear", "metric": "wd_cost"}
+    (row,) = rows_of(analysis.tables["levels"], **at).itertuples()
     assert row.iqm == pytest.approx(sum(costs) / 2)
     assert row.iqm > 0
 

@@ -9,7 +9,7 @@ import pytest
 
 from sme_registry.studies.report.analysis import ENOUGH_RUNS, change_verdict
 from sme_registry.studies.report.findings import findings
-from tests.studies.finished import analysed, with_tables
+from tests.studies.finished import analysed, found, rows_of, with_tables
 
 pytest.importorskip("matplotlib")
 
@@ -31,14 +31,6 @@ def contrasted(analysis, class_name, fields):
     return with_tables(analysis, contrasts=rows)
 
 
-def found(analysis, **at):
-    """The rows of findings with these values, by question."""
-    rows = findings(analysis)
-    for name, value in at.items():
-        rows = rows[rows[name] == value]
-    return {row.question: row for row in rows.itertuples()}
-
-
 def of_alpha(analysis):
     return found(analysis, section="tasks", algorithm="Alpha")
 
@@ -55,8 +47,7 @@ def test_findings_name_the_property_that_each_learner_was_built_to_fail_at(analy
 
 
 def test_every_axis_has_a_verdict_those_that_hurt_first(analysis):
-    rows = findings(analysis)
-    rows = rows[(rows.algorithm == "Alpha") & (rows.question == "axis")]
+    rows = rows_of(findings(analysis), algorithm="Alpha", question="axis")
     assert list(zip(rows.class_name, rows.verdict, strict=True)) == [
         ("r_min-0_5", "worse"), ("k-25", "worse"), ("complexity-10", "open"), ("plane", "open"),
     ]  # fmt: skip
@@ -67,8 +58,7 @@ def test_a_lower_regret_is_told_by_the_value_of_the_field_and_makes_the_headline
     lower = contrasted(analysis, "r_min-0_5", fields)
     for name in ("k-25", "complexity-10", "plane"):
         lower = contrasted(lower, name, {"change": 0.0, "low": -0.1, "high": 0.1})
-    rows = findings(lower)
-    of_axes = rows[(rows.algorithm == "Alpha") & (rows.question == "axis")]
+    of_axes = rows_of(findings(lower), algorithm="Alpha", question="axis")
     assert [*of_axes.verdict] == ["better", "open", "open", "open"]
     where = "where minimum reward r_min is 0.5 (class r_min-0_5): "
     assert of_axes.sentence.iloc[0].startswith(f"Its WD regret is lower {where}−0.30 (")

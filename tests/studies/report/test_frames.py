@@ -16,6 +16,7 @@ from sme_registry.studies.report.design import ALL, metrics_of
 from sme_registry.studies.report.frames import StudyFrames
 from sme_registry.studies.report.texts import comparison_tables
 from tests.commands import good
+from tests.studies.finished import rows_of
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +70,14 @@ def test_final_return_is_in_percent_of_the_optimum(loaded):
     assert np.allclose(last / 20 * 100, expected.reindex(last.index))
 
 
-def test_every_column_is_documented_and_is_there_without_results(finished, loaded, tmp_path):
+@pytest.mark.parametrize(
+    ("study", "load"), [("finished", studies.load), ("lived", studies.load_streams)]
+)
+def test_every_column_is_documented_and_is_there_without_results(study, load, request, tmp_path):
     documented = set(re.findall(r"\w+", str(frames.__doc__)))
-    (tmp_path / "plan.json").write_bytes((finished / "plan.json").read_bytes())
-    for empty, full in zip(studies.load(tmp_path), loaded, strict=True):
+    folder = request.getfixturevalue(study)
+    (tmp_path / "plan.json").write_bytes((folder / "plan.json").read_bytes())
+    for empty, full in zip(load(tmp_path), load(folder), strict=True):
         assert not set(full) - documented
         assert len(empty) == 0
         pd.testing.assert_series_equal(empty.dtypes, full.dtypes)
@@ -86,7 +91,7 @@ def test_every_metric_is_a_column_of_its_frame(loaded):
 
 
 def row(table, class_name, metric="wd_regret"):
-    return table[(table.class_name == class_name) & (table.metric == metric)].iloc[0]
+    return rows_of(table, class_name=class_name, metric=metric).iloc[0]
 
 
 def test_the_difference_is_that_of_runs_with_one_instance_and_seed(loaded):

@@ -10,7 +10,7 @@ from sme_registry.studies.report.design import ALL
 from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.report.texts import text_tables
 from sme_registry.studies.result import OfflineCell
-from tests.studies.finished import study_file
+from tests.studies.finished import rows_of, study_file
 
 pytest.importorskip("matplotlib")
 
@@ -108,8 +108,7 @@ def test_learners_of_one_kind_are_named_by_their_settings_other_than_nu():
 
 def of_learner(analysis, name):
     """The sentences on a learner, by verdict."""
-    rows = findings(analysis)
-    rows = rows[(rows.section == "offline") & (rows.algorithm == name)]
+    rows = rows_of(findings(analysis), section="offline", algorithm=name)
     return dict(zip(rows.verdict, rows.sentence, strict=True))
 
 
@@ -144,7 +143,7 @@ def test_few_runs_give_indications_at_most(file, done, runs):
 
 
 def test_only_learners_with_equal_data_are_compared(analysis):
-    rows = analysis.tables["improvements"][analysis.tables["improvements"].group == ALL]
+    rows = rows_of(analysis.tables["improvements"], group=ALL)
     pairs = set(zip(rows["first"], rows["second"], strict=True))
     learners = {("BC (0)", "IQL (0)"), ("BC (0.5)", "IQL (0.5)")}
     assert pairs == learners

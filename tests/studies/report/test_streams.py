@@ -2,11 +2,9 @@
 
 import dataclasses
 import functools
-import re
 import shutil
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy.stats import trim_mean
 
@@ -16,10 +14,10 @@ from sme_registry.io import read_json
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report import analysis as tables
-from sme_registry.studies.report import frames
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.result import CellFailure
 from tests.studies import finished
+from tests.studies.finished import found, rows_of
 from tests.studies.lives import AGENTS, STREAMS, TASK, live, stream_study
 
 pytest.importorskip("matplotlib")
@@ -27,7 +25,6 @@ pytest.importorskip("matplotlib")
 from sme_registry.studies.report.write import page, write_report
 from tests.geometry import assert_readable
 from tests.page import Page
-from tests.studies.report.test_findings import found
 
 FIGURES = {
     "stream-metrics", "stream-regret", "stream-plasticity", "stream-learning-curves",
@@ -36,16 +33,10 @@ FIGURES = {
 RUN = ["class_name", "algorithm", "run"]
 
 
-@pytest.fixture(scope="session")
-def study(once):
-    """Every life and fresh agent has finished."""
-    return once("lives-study", lambda folder: live(stream_study(), folder))
-
-
 @pytest.fixture(scope="module")
-def gaps(study, tmp_path_factory):
+def gaps(lived, tmp_path_factory):
     """Without the fresh agents of Tired, and two lives of Stubborn, of which one failed."""
-    folder = shutil.copytree(study, tmp_path_factory.mktemp("gaps") / "study")
+    folder = shutil.copytree(lived, tmp_path_factory.mktemp("gaps") / "study")
     for planned in stream_study().plan.cells:
         stubborn = (planned.class_name, planned.algorithm) == ("Switch", "Stubborn")
         fresh_of_tired = (planned.algorithm, planned.phase) == ("Tired", 0)
@@ -62,9 +53,9 @@ analysed = functools.cache(finished.analysed)
 
 
 @pytest.fixture(scope="module")
-def streams(study):
+def streams(lived):
     """The tables of `study`."""
-    return analysed(study)
+    return analysed(lived)
 
 
 def text_of(analysis):
@@ -72,17 +63,14 @@ def text_of(analysis):
     return Page(page(analysis)).words
 
 
-def within(rows, **at):
-    for name, value in ({"region": "WD"} | at).items():
-        rows = rows[rows[name] == value]
-    return rows
+within = functools.partial(rows_of, region="WD")
 
 
 # Frames
 
 
-def test_frames_have_the_numbers_of_the_reports_and_of_the_fresh_agents(study):
-    loaded, results = studies.load_streams(study), Ledger(study).results()
+def test_frames_have_the_numbers_of_the_reports_and_of_the_fresh_agents(lived):
+    loaded, results = studies.load_streams(lived), Ledger(lived).results()
     assert len(loaded.lives) == 3 * 3 * 5 * 4  # streams, algorithms, runs; WD, two shells, OOD
     assert not loaded.lives.duplicated([*RUN, "region"]).any()
     for row in loaded.lives.itertuples():
@@ -118,18 +106,7 @@ def test_frames_have_the_numbers_of_the_reports_and_of_the_fresh_agents(study):
     assert tuple(cycle.visit[2:]) == (0, 0, 1, 1, 2, 2, 3, 3)
 
 
-def test_every_column_is_documented_and_is_there_without_results(study, tmp_path):
-    documented = set(re.findall(r"\w+", str(frames.__doc__)))
-    (tmp_path / "plan.json").write_bytes((study / "plan.json").read_bytes())
-    for empty, full in zip(
-        studies.load_streams(tmp_path), studies.load_streams(study), strict=True
-    ):
-        assert not set(full) - documented
-        assert len(empty) == 0
-        pd.testing.assert_series_equal(empty.dtypes, full.dtypes)
-
-
-def test_results_and_curves_hold_single_tasks_alone(study, tmp_path):
+def test_results_and_curves_hold_single_tasks_alone(lived, tmp_path):
     learner = {"name": "Alpha", "uses": "tests.studies.learners:blend",
                "hyperparameters": {"half_life": 10.0}}  # fmt: skip
     fields = {
@@ -153,7 +130,7 @@ def test_results_and_curves_hold_single_tasks_alone(study, tmp_path):
     assert "No class was shown to change the WD regret of Alpha" in text
     assert "Alpha was not shown to forget" in text
     with pytest.raises(OptionError, match=r"has streams alone.*sme study report"):
-        studies.compare(study, "Tired", "Stubborn")
+        studies.compare(lived, "Tired", "Stubborn")
 
 
 # Tables
@@ -167,25 +144,19 @@ def test_a_table_has_the_iqm_over_lives_with_its_interval(streams):
         assert row.runs == 5
         assert row.iqm == pytest.approx(trim_mean(values, 0.25), abs=1e-12)
         assert row.low <= row.iqm <= row.high
-    M = within(
-        streams.tables["stream_matrices"], class_name="Related", algorithm="Forgetful", phase=1
-    )
-    retention = within(
-        streams.tables["stream_retention"], class_name="Related", algorithm="Forgetful"
-    )
+    at = {"class_name": "Related", "algorithm": "Forgetful", "phase": 1}
+    M, retention = (within(streams.tables[f"stream_{n}"], **at) for n in ("matrices", "retention"))
     assert np.isnan(M.visit.astype(float)[:1]).all()
     for row in M[1:].itertuples():
-        values = retention[(retention.visit == row.visit) & (retention.phase == 1)]
+        values = rows_of(retention, visit=row.visit)
         assert row.iqm == pytest.approx(trim_mean(values.normalised_regret, 0.25))
 
 
 def test_streams_are_compared_by_runs_of_equal_number(streams):
-    rows = streams.tables["stream_contrasts"][
-        streams.tables["stream_contrasts"].algorithm == "Forgetful"
-    ]
+    rows = rows_of(streams.tables["stream_contrasts"], algorithm="Forgetful")
     axes = {"Related": "tasks", "Cycle": "schedule"}
     assert dict(zip(rows.class_name, rows.axis, strict=True)) == axes
-    (row,) = rows[(rows.class_name == "Related") & (rows.metric == "forgetting")].itertuples()
+    (row,) = rows_of(rows, class_name="Related", metric="forgetting").itertuples()
     lives = within(streams.tables["stream_lives"], algorithm="Forgetful").set_index(
         ["class_name", "run"]
     )
@@ -250,16 +221,10 @@ def test_what_is_missing_is_counted_and_leaves_plasticity_unknown(gaps):
     missing = streams.tables["stream_missing"]
     assert (len(missing), missing.key.nunique()) == (2 + 3 * 5, 2 + 5)
     assert (streams.finished, streams.requested, streams.planned) == (113, 120, 120)
-    tired = streams.tables["stream_metrics"][
-        streams.tables["stream_metrics"].algorithm == "Tired"
-    ].metric
+    tired = rows_of(streams.tables["stream_metrics"], algorithm="Tired").metric
     assert not {"plasticity_ratio", "plasticity_difference", "learning_transfer"} & set(tired)
     assert {"forgetting", "online_regret"} < set(tired)
-    assert (
-        streams.tables["stream_regret"][streams.tables["stream_regret"].algorithm == "Tired"]
-        .fresh.isna()
-        .all()
-    )
+    assert rows_of(streams.tables["stream_regret"], algorithm="Tired").fresh.isna().all()
     tired = found(streams, section="streams", class_name="Switch", algorithm="Tired")
     assert "plasticity ratio" not in tired
     assert found(streams)["fresh agents"].value == 15
@@ -277,8 +242,7 @@ def test_what_is_missing_is_counted_and_leaves_plasticity_unknown(gaps):
 
 def verdicts(rows, **at):
     """The verdicts of findings with these values, by algorithm."""
-    for name, value in at.items():
-        rows = rows[rows[name] == value]
+    rows = rows_of(rows, **at)
     return dict(zip(rows.algorithm, rows.verdict, strict=True))
 
 
@@ -288,11 +252,11 @@ def test_findings_name_what_each_agent_was_made_to_do(streams):
     forgets = {"Tired": "above", "Forgetful": "above", "Stubborn": "open"}
     judged = verdicts(rows, question="forgetting", **place)
     assert list(judged.items()) == list(forgets.items())  # who forgets most comes first
-    more = rows[(rows.question == "forgets more") & (rows.class_name == "Related")]
+    more = rows_of(rows, question="forgets more", class_name="Related")
     assert list(more.verdict) == ["below", "above", "above"]
     assert ((more.low <= more.value) & (more.value <= more.high)).all()
     assert more.sentence.iloc[0].startswith("Forgetful forgets less than Tired: the difference is")
-    more = rows[(rows.question == "forgets more") & (rows.class_name == "Switch")]
+    more = rows_of(rows, question="forgets more", class_name="Switch")
     assert list(more.verdict) == ["open", "above", "above"]
     plasticity = {"Forgetful": "open", "Tired": "above", "Stubborn": "above"}
     at = {"section": "streams", "class_name": "Switch"}
@@ -347,9 +311,9 @@ def test_agents_that_have_learnt_nothing_are_marked(streams):
 
 
 def test_the_report_of_streams_alone_is_whole_readable_and_the_same_each_time(
-    study, streams, tmp_path, drawn
+    lived, streams, tmp_path, drawn
 ):
-    files = write_report(study, tmp_path / "one", ["html", "csv", "latex"], full=True)
+    files = write_report(lived, tmp_path / "one", ["html", "csv", "latex"], full=True)
     page = Page(files[0].read_text())
     ids = page.values("id")
     names = [name.removeprefix("figure-") for name in ids if name.startswith("figure-")]
@@ -363,7 +327,7 @@ def test_the_report_of_streams_alone_is_whole_readable_and_the_same_each_time(
     written = {path.stem for path in files if path.suffix == ".csv"}
     assert "stream_lives" in written
     assert "results" not in written
-    again = write_report(study, tmp_path / "two", ["csv", "latex"], full=True)
+    again = write_report(lived, tmp_path / "two", ["csv", "latex"], full=True)
     for path in again:
         first = tmp_path / "one" / path.relative_to(tmp_path / "two")
         assert path.read_bytes() == first.read_bytes()
