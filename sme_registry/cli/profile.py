@@ -145,7 +145,7 @@ def _made(
     from sme_registry.profiles import page, run
 
     if runs is not None:
-        given = [f"--{key}" for key, value in options.items() if value and key != "name"]
+        given = [f"--{key}" for key, value in options.items() if value]
         if given:
             raise OptionError(f"{given[0]}: is for a training, and --runs trains nothing.")
         made, files = run.profile_of(runs, algorithm), folder or runs

@@ -366,6 +366,7 @@ class TestCommand:
             ("show", "PPOO"): "Did you mean 'PPO'",
             ("--runs", "none"): "holds no study",
             ("--runs", "none", "--quick"): "trains nothing",
+            ("--runs", "none", "--name", "x"): "--name: is for a training",
             ("/usr/lib/python3/none.py",): "must be a Python file",
         }.items():
             assert message in commands.refused("profile", *arguments), arguments
