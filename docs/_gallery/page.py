@@ -162,7 +162,8 @@ def _stream_tables(known: dict[str, Any], lives: list[results.Life]) -> list[str
     ]
     tables = [_table(("`sme check`, over phases", ", ".join(outcomes)), certificate)]
     if lives:
-        link = f"[{lives[0].lives} lives]({_page(results.STREAM_PAGE)}), IQM"
+        counts = ", ".join(str(life.lives) for life in lives)
+        link = f"[{counts} lives]({_page(results.STREAM_PAGE)}), IQM"
         rows = [
             (label, *(_value(life.metrics[name][0]) for life in lives))
             for name, label in _METRICS.items()
