@@ -240,7 +240,7 @@ class Profile(StoredModel):
         text = f"{self.name} breaks most along {least}: it keeps {kept[least]} of its performance."
         near = [label for label in others if kept[label].low <= kept[least].high]
         if near:
-            text += f" The intervals along {_listed(near, kept)} overlap with it."
+            text += f" Its interval overlaps with those along {_listed(near, kept)}."
         if others:
             text += f" It is hurt least along {others[-1]}: {kept[others[-1]]}."
         few = min(each.draws for each in kept.values()) < ENOUGH_RUNS

@@ -169,7 +169,7 @@ class TestFacts:
         spread = made(lambda level, i: regrets.get(level, 0.2) + 0.03 * (i - 2))
         text = spread.sentences([])[0]
         assert "breaks most along reward interval k" in text
-        assert "The intervals along survival threshold D (0.53 [0.49" in text
+        assert "Its interval overlaps with those along survival threshold D (0.53 [0.49" in text
         exact = made(lambda level, i: regrets.get(level, 0.2))
         assert "overlap" not in exact.sentences([])[0]
 
