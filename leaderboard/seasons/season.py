@@ -50,13 +50,7 @@ from leaderboard.errors import Rejection
 from sme_registry.errors import ActionError, WireError
 from sme_registry.io import sha256_of
 from sme_registry.seasons.transcript import Count, Head, TicketHeads
-from sme_registry.seasons.wire import (
-    MAX_INSTANCES,
-    Hidden,
-    HiddenClass,
-    instances_of,
-    unpack_table,
-)
+from sme_registry.seasons.wire import MAX_INSTANCES, Hidden, HiddenClass, instances_of, unpack_table
 from sme_registry.spec import EvaluationProtocol, Setting
 from sme_registry.spec.document import (
     Digest,
