@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from sme_registry.cli.arguments import Json, changes
+from sme_registry.cli.arguments import Json, changes, only_with
 from sme_registry.cli.plan import Agents, Jobs
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import choice
@@ -19,10 +19,13 @@ from sme_registry.training.algorithms import nested_hyperparameters
 app = typer.Typer()
 
 _SHOW = "show"
+_WITH_SHOW = "subject", "name", "json"
+_WITH_RUNS = "runs", "algorithm", "folder", "quick", "json"
 
 
 @app.command()
 def profile(
+    context: typer.Context,
     subject: Annotated[
         str | None,
         typer.Argument(
@@ -56,7 +59,10 @@ def profile(
     ] = None,
     runs: Annotated[
         Path | None,
-        typer.Option(help="Train nothing: the profile of a study's runs, in this folder."),
+        typer.Option(
+            help="Train nothing: the profile of a study's runs, in this folder. With --quick of "
+            "these levels alone."
+        ),
     ] = None,
     jobs: Jobs = None,
     json: Json = False,
@@ -100,15 +106,27 @@ def profile(
       sme profile --runs runs/mine
       sme profile show PPO
     """
+    from sme_registry.profiles import page, run
+
     if subject == _SHOW:
+        others = [option for option in context.params if option not in _WITH_SHOW]
+        only_with(context, others, "is not for show. Leave it out")
         _show(name, json)
         return
     _check_subject(subject, name, algorithm, runs)
-    made, files = _made(
-        subject, algorithm, runs, folder,
-        agents=agents, hyperparameters=nested_hyperparameters(changes(set_)), name=title,
-        steps=steps, seeds=seeds, quick=quick, jobs=jobs, retry_failed=retry,
-    )  # fmt: skip
+    if runs is not None:
+        others = [option for option in context.params if option not in _WITH_RUNS]
+        only_with(context, others, "is for a training, and --runs trains nothing. Leave one out")
+        made = run.profile_of(runs, algorithm, classes=run.quick_classes() if quick else None)
+        files = folder or runs
+        page.write_page(made, files)
+    else:
+        made = run.profile(
+            algorithm or uses_of(subject or ""), folder=folder,
+            agents=agents, hyperparameters=nested_hyperparameters(changes(set_)), name=title,
+            steps=steps, seeds=seeds, quick=quick, jobs=jobs, retry_failed=retry,
+        )  # fmt: skip
+        files = folder or run.default_folder(made.name)
     _print(made, json)
     if not json:
         print_line(escape(str(files / "profile.html")))
@@ -132,27 +150,6 @@ def _check_subject(
         raise OptionError(f"{subject!r}: is given beside --algorithm or --runs. Leave one out.")
     if subject is None and not (algorithm or runs):
         raise OptionError("Give a FILE, --algorithm or --runs. See `sme profile --help`.")
-
-
-def _made(
-    subject: str | None,
-    algorithm: str | None,
-    runs: Path | None,
-    folder: Path | None,
-    **options: Any,
-) -> tuple[Any, Path]:
-    """The profile, and the folder that its page is in."""
-    from sme_registry.profiles import page, run
-
-    if runs is not None:
-        given = [f"--{key}" for key, value in options.items() if value]
-        if given:
-            raise OptionError(f"{given[0]}: is for a training, and --runs trains nothing.")
-        made, files = run.profile_of(runs, algorithm), folder or runs
-        page.write_page(made, files)
-        return made, files
-    made = run.profile(algorithm or uses_of(subject or ""), folder=folder, **options)
-    return made, folder or run.default_folder(made.name)
 
 
 def uses_of(subject: str) -> str:

@@ -258,7 +258,7 @@ class Profile(StoredModel):
         text = f"On the default its N₀ is {self.level(DEFAULT)}"
         if not self.learns:
             return f"{text}; it does not learn."
-        text, half = f"{text} after {self.steps:,} steps", self.steps_to_half()
+        text, half = f"{text} after {self.budget}", self.steps_to_half()
         if half is None:
             return f"{text}; when it fell to ½ is unknown, as it was evaluated at the end alone."
         if math.isinf(half):
@@ -309,8 +309,11 @@ class Profile(StoredModel):
 
     @property
     def budget(self) -> str:
-        """The steps of each training."""
-        return f"{self.steps:,} steps" if self.learns else "no training"
+        """The steps of each training; a function may take fewer."""
+        if not self.learns:
+            return "no training"
+        most = "at most " if self.algorithm.uses.startswith("train:") else ""
+        return f"{most}{self.steps:,} steps"
 
     @property
     def planned(self) -> int:

@@ -284,6 +284,7 @@ class TestRun:
         page = (folder / "profile.html").read_text()
         assert "boom" in page
         assert "http://" not in page.replace("http://www.w3.org", "")
+        assert "with at most 300 steps each" in page
         row = next(row for row in profile.rows if row.class_name == DEFAULT)
         assert row.wd_regret < 1e-3
         assert row.evaluations == 3
@@ -344,6 +345,9 @@ class TestRun:
         assert "4 of 8 finished, 4 not run" in page
         with pytest.raises(UnknownNameError, match="algorithm=None: must be 'linear' or"):
             run.profile_of("study")
+        run_study(file, "study", only=["class=k-25", "algorithm=linear"], **options)
+        quick = run.profile_of("study", "linear", classes=run.quick_classes())
+        assert (quick.planned, len(quick.rows)) == (2 * 2, 2 * 2)
 
 
 class TestCommand:
@@ -365,7 +369,9 @@ class TestCommand:
             ("mine.py:missing",): "has no function 'missing'",
             ("show", "PPOO"): "Did you mean 'PPO'",
             ("--runs", "none"): "holds no study",
-            ("--runs", "none", "--quick"): "trains nothing",
+            ("--runs", "none", "--quick"): "holds no study",
+            ("--runs", "none", "--jobs", "2"): "--jobs: is for a training",
+            ("show", "PPO", "--quick"): "--quick: is not for show",
             ("--runs", "none", "--name", "x"): "--name: is for a training",
             ("/usr/lib/python3/none.py",): "must be a Python file",
         }.items():
