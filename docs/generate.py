@@ -19,8 +19,7 @@ from sme_registry.datasets.documents import Behaviour
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.io import write_atomically
 from sme_registry.io.markup import fixed
-from sme_registry.profiles.document import Profile
-from sme_registry.profiles.levels import AXES
+from sme_registry.profiles.document import AXES, Profile
 from sme_registry.spec import (
     AgentSpec,
     Drift,

@@ -21,7 +21,7 @@ import pandas as pd
 from sme_registry import SMESpec, materialize
 from sme_registry.diagnosis.behaviour import probe_capacity
 from sme_registry.evaluation import Perceptron
-from sme_registry.profiles.levels import plan_file
+from sme_registry.profiles.document import plan_file
 
 ROWS = Path(__file__).parent / "ablations-in-jax" / "clones.csv"
 NETWORKS = {

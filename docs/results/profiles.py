@@ -20,8 +20,7 @@ import signal
 from pathlib import Path
 
 from sme_registry import Profile
-from sme_registry.profiles.document import REFERENCES
-from sme_registry.profiles.levels import AXES, TWO_LAYERS, plan_file
+from sme_registry.profiles.document import AXES, REFERENCES, TWO_LAYERS, plan_file
 from sme_registry.profiles.run import part_of_profile, slug
 from sme_registry.studies import run_study
 

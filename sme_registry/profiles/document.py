@@ -1,4 +1,4 @@
-"""`Profile`: where an algorithm breaks, as facts, and what follows from them.
+"""`Profile`: where an algorithm breaks along `AXES`, as facts, and what follows from them.
 
 It is a study, whose plan is `profile-v1` with the one algorithm: the default and two harder levels
 of each of nine axes, with some draws of each.
@@ -24,8 +24,7 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 
 from sme_registry.io.markup import Table, card, conjunction, fixed, plural, signed, table_html
-from sme_registry.profiles.levels import AXES, COMPARED, DEFAULT, Axis, plan_file
-from sme_registry.spec import StudyAlgorithm
+from sme_registry.spec import StudyAlgorithm, StudyFile, catalogue
 from sme_registry.spec.document import Digest, Integer, Real, StoredModel, StrictModel, TupleOf
 from sme_registry.spec.study import PlannedCell
 from sme_registry.statistics import Array, Statistic, iqm
@@ -35,11 +34,51 @@ from sme_registry.studies.report.findings import THRESHOLDS
 from sme_registry.studies.report.tables import paired
 from sme_registry.studies.result import CellResult
 
+COMPARED = "PPO", "TD3", "SAC"  # in sentences; other references are in figures and tables
+DEFAULT, TWO_LAYERS = "default", "complexity-2"
 REFERENCES = Path(__file__).parent / "references"
 UNLEARNT = THRESHOLDS["unlearnt"]
 DIGITS = 6
 _HALF = 0.5
 _NAMED = 3  # axes, in one sentence
+
+
+class Axis(NamedTuple):
+    """What its levels change, and they by the names of their classes, the base first."""
+
+    label: str
+    levels: Mapping[str, str]
+
+    @property
+    def base(self) -> str:
+        return next(iter(self.levels))
+
+    @property
+    def harder(self) -> list[str]:
+        return [*self.levels][1:]
+
+
+def _axis(label: str, stem: str, values: str, base: str = DEFAULT) -> Axis:
+    first, *harder = values.split()
+    names = {f"{stem}-{value.replace('.', '_')}": value for value in harder}
+    return Axis(label, {base: first, **names})
+
+
+AXES = (
+    _axis("state dimension S", "state_dim", "8 16 64"),
+    _axis("action dimension A", "action_dim", "4 8 16"),
+    _axis("reward interval k", "k", "1 5 25"),
+    _axis("reward threshold r_min", "r_min", "0 0.5 0.75"),
+    _axis("survival threshold D", "D", "0 0.25 0.5"),
+    _axis("complexity L", "complexity", "1 2 10"),
+    _axis("foresight, scale of shaping", "shaping-scale", "0 10 30", TWO_LAYERS),
+    _axis("noise of the reward σ", "noise-reward", "0 0.3 1", TWO_LAYERS),
+    _axis("distractors", "observation-distractors", "0 8 32"),
+)
+
+
+def plan_file() -> StudyFile:
+    return catalogue.find(StudyFile, "profile")
 
 
 class ProfileRow(StrictModel):
@@ -283,7 +322,7 @@ class Profile(StoredModel):
 
     def draw(self, others: Iterable[Profile] | None = None) -> Any:
         """The figure of all axes, with the references behind, or with `others`."""
-        from sme_registry.profiles.figures import draw_axes
+        from sme_registry.profiles.page import draw_axes
 
         return draw_axes(self, self.behind(others))
 

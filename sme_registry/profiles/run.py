@@ -13,8 +13,7 @@ from typing import Any
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import check_writable, choice, require_packages
 from sme_registry.io.system import module_file
-from sme_registry.profiles.document import Profile, ProfileFailure, row_of
-from sme_registry.profiles.levels import AXES, DEFAULT, plan_file
+from sme_registry.profiles.document import AXES, DEFAULT, Profile, ProfileFailure, plan_file, row_of
 from sme_registry.profiles.page import write_page
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.spec.study import Cell

@@ -12,15 +12,14 @@ import sme_registry
 from sme_registry import Profile
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation.evaluate import resolve_protocol
-from sme_registry.profiles import document, figures, levels, run
-from sme_registry.profiles.document import REFERENCES, ProfileRow
-from sme_registry.profiles.levels import AXES, DEFAULT, TWO_LAYERS
+from sme_registry.profiles import document, page, run
+from sme_registry.profiles.document import AXES, DEFAULT, REFERENCES, TWO_LAYERS, ProfileRow
 from sme_registry.profiles.page import write_page
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.studies import run_study
 from tests import commands
 
-PLAN = levels.plan_file()
+PLAN = document.plan_file()
 RELEASED = {  # levels that the catalogue has as tasks
     "state_dim": "StateDim{}", "action_dim": "ActionDim{}", "k": "Interval{}",
     "r_min": "MinReward{}", "D": "Survival{}", "shaping-scale": "Foresight{}",
@@ -203,7 +202,7 @@ class TestFacts:
 
     def test_what_is_outside_a_figure_is_marked_at_its_edge(self):
         low = made(lambda level, i: 0.2 if level in (DEFAULT, TWO_LAYERS) else 2.5 + 0.01 * i)
-        for figure in (low.draw([]), figures.draw_robustness(low, [])):
+        for figure in (low.draw([]), page.draw_robustness(low, [])):
             for axes in figure.axes:
                 (left, right), (bottom, top) = axes.get_xlim(), sorted(axes.get_ylim())
                 for line in axes.lines:
