@@ -2,9 +2,11 @@
 
     python docs/results/summary.py ablations
     python docs/results/summary.py ablations --rows runs.csv --from report/tables/results.csv
+    python docs/results/summary.py continual --rows lives.csv --from report/tables/stream_lives.csv
 
 The second form first writes `runs.csv`, one row a run, from the table that `sme study report
---full` writes with one row a run and region.
+--full` writes with one row a run and region; the third the rows of lives or, from
+`stream_visits.csv`, of their visits.
 """
 
 from __future__ import annotations
@@ -25,6 +27,16 @@ RESULTS = Path(__file__).parent
 RUN = ["algorithm", "class_name", "run", "steps", "complexity", "spec_digest", "seed", "uses"]
 KEPT = ["online_regret", "linear_normalised_regret"]
 BY_REGION = ["normalised_regret", "similarity"]
+LIFE = (
+    "class_name algorithm run stream_digest seed steps visited_regret average_performance "
+    "backward_transfer forgetting forward_transfer relearning plasticity_ratio "
+    "plasticity_difference learning_transfer online_regret"
+).split()
+VISIT = (
+    "class_name algorithm run visit phase normalised_regret fresh_normalised_regret "
+    "average_performance backward_transfer forgetting plasticity_ratio plasticity_difference "
+    "online_regret fresh_online_regret learning_transfer"
+).split()
 OF_LIVES = (
     "visited_regret",
     "forgetting",
@@ -43,6 +55,12 @@ def compact(results: pd.DataFrame) -> pd.DataFrame:
     wide.columns = [f"{name}_{m}" for name, m in wide.columns]
     kept = results[region == 0].set_index(RUN)[KEPT]  # in the report's order, the plan's
     return kept.join(wide).reset_index().round(6)
+
+
+def in_cube(lives: pd.DataFrame) -> pd.DataFrame:
+    """One row a life, or a visit of one."""
+    columns = VISIT if "visit" in lives else LIFE
+    return lives.loc[lives["region"] == "WD", columns].round(6)
 
 
 def rows(*path: str) -> pd.DataFrame:
@@ -277,7 +295,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.results:
         frames = pd.concat(pd.read_csv(path) for path in options.results)
-        compact(frames).to_csv(options.rows, index=False)
+        made = in_cube(frames) if options.page == "continual" else compact(frames)
+        made.to_csv(options.rows, index=False)
     print(printed(options.page))
 
 
