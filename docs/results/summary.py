@@ -27,16 +27,6 @@ RESULTS = Path(__file__).parent
 RUN = ["algorithm", "class_name", "run", "steps", "complexity", "spec_digest", "seed", "uses"]
 KEPT = ["online_regret", "linear_normalised_regret"]
 BY_REGION = ["normalised_regret", "similarity"]
-LIFE = (
-    "class_name algorithm run stream_digest seed steps visited_regret average_performance "
-    "backward_transfer forgetting forward_transfer relearning plasticity_ratio "
-    "plasticity_difference learning_transfer online_regret"
-).split()
-VISIT = (
-    "class_name algorithm run visit phase normalised_regret fresh_normalised_regret "
-    "average_performance backward_transfer forgetting plasticity_ratio plasticity_difference "
-    "online_regret fresh_online_regret learning_transfer"
-).split()
 OF_LIVES = (
     "visited_regret",
     "forgetting",
@@ -58,8 +48,9 @@ def compact(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def in_cube(lives: pd.DataFrame) -> pd.DataFrame:
-    """One row a life, or a visit of one."""
-    columns = VISIT if "visit" in lives else LIFE
+    """One row a life, or a visit of one, with the columns that are beside the page."""
+    beside = RESULTS / "continual" / ("lives-visits.csv" if "visit" in lives else "lives.csv")
+    columns = pd.read_csv(beside, nrows=0).columns
     return lives.loc[lives["region"] == "WD", columns].round(6)
 
 
