@@ -42,13 +42,9 @@ from sme_registry.task import Task, draw
 from sme_registry.task.draw import bit_generator, to_uniform
 from sme_registry.task.loading import check_memory
 from sme_registry.task.task import (
-    COST,
-    PRICE,
+    NUMBERS,
     REGRET,
     REWARD,
-    REWARD_NOISE,
-    SAFE_REGRET,
-    SHAPING,
     SIMILARITY,
     STEP_REWARD,
     Array,
@@ -63,11 +59,6 @@ Act = Callable[[Array, Observation], Array]
 BehaviourPolicy = Callable[[range], Act]
 """How to act in new episodes with these numbers, one in each environment."""
 
-_ON_TOP = (
-    ("compensated", "prices", PRICE),
-    ("shaping", "shapings", SHAPING),
-    ("reward_noise", "reward_noises", REWARD_NOISE),
-)
 _AHEAD = 64  # steps whose random numbers an episode reads at once
 _BLOCK = 64  # observations in one call of a user's policy
 _ENVS = 512
@@ -327,11 +318,10 @@ def _join(parts: list[Arrays], spec: SMESpec) -> Transitions:
         return agents.copy() if spec.team is not None else agents[:, 0].copy()
 
     if spec.safety is not None:
-        columns |= {"costs": of_row(COST), "safe_regrets": of_row(SAFE_REGRET)}
         columns |= {"limits": limits[:, 0].copy(), "safe_actions": limits[:, 1].copy()}
-    for attribute, name, row in _ON_TOP:
-        if getattr(spec, attribute):
-            columns[name] = of_row(row)
+    for row, (name, field) in enumerate(NUMBERS.items()):
+        if field and getattr(spec, field):
+            columns[f"{name}s"] = of_row(row)
     noise = columns.pop("noise")
     if task_noise := spec.noise:
         columns |= {"transition_noises": noise} if task_noise.transition else {}
