@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("--folder", default="runs/profiles", help="of the study")
     parser.add_argument("--minutes", type=int, default=0, help="stop after so many")
     parser.add_argument("--jobs", type=int, help="programs at once; default one per core")
+    parser.add_argument("--lanes", type=int, help="runs of a program; 3 are faster than 10 of SAC")
     parser.add_argument("--out", type=Path, default=REFERENCES)
     options = parser.parse_args()
     if options.minutes:
@@ -72,7 +73,8 @@ def main() -> None:
         try:
             if missing and not stopped:
                 only = [f"algorithm={name}", *missing]
-                run_study(file, options.folder, only=only, jobs=options.jobs)
+                sizes = {"jobs": options.jobs, "lanes": options.lanes}
+                run_study(file, options.folder, only=only, **sizes)
         except KeyboardInterrupt as interrupt:
             print(interrupt)
             stopped = True
