@@ -189,7 +189,8 @@ def _worst(analysis: Analysis, name: str, metric: str) -> Found:
     if not worse:
         text = f"No class was shown to change the {regret} of {name}"
         text += f" from that on {analysis.base}, which does not show that none does."
-        yield finding("tasks", f"worst {regret}", "none_shown", text, algorithm=name)
+        if contrasts:
+            yield finding("tasks", f"worst {regret}", "none_shown", text, algorithm=name)
         return
     worst = max(worse, key=lambda row: row.change)
     severity = "slightly_hurt"
@@ -228,10 +229,10 @@ def _comparison(analysis: Analysis) -> Found:
         source = data[name]
         of_data = f" of those with data of ν = {source[0]:g}" if source else ""
         yield finding(
-            "comparison", "best", "best",
-            f"Over the {plural(row.classes, 'class', 'classes')} on which all have runs, {name} is "
-            f"best within distribution{of_data}: its WD regret is {fixed(row.value)} "
-            f"{_interval(row)}, where 0 is the optimum and 1 the constant ½.",
+            "comparison", "best", _of_few("best", row.fewest_runs),
+            f"Over the {plural(row.classes, 'class', 'classes')} on which all have runs, {name} "
+            f"has the lowest WD regret{of_data}: {fixed(row.value)} {_interval(row)}, where 0 is "
+            "the optimum and 1 the constant ½.",
             row,
         )  # fmt: skip
     for row in analysis.rows("improvements", **over_all).itertuples():

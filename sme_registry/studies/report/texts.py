@@ -33,6 +33,10 @@ _INTERVAL = "with its 95 % bootstrap interval"
 _MARK = " †"
 _MARKS = f"†: the interval excludes 0, with at least {ENOUGH_RUNS} pairs per class."
 _OF_FEW = f"With fewer than {ENOUGH_RUNS}, a result is an indication."
+_SHARED = (
+    "Several pairs share an instance: such runs are not independent draws of the task, so the "
+    "interval is too narrow for other instances."
+)
 _DIFFERENCE = f"{_INTERVAL}. {_MARKS}"
 
 
@@ -287,12 +291,11 @@ def difference_caveats(rows: pd.DataFrame) -> list[str]:
             f"With fewer than {ENOUGH_RUNS} pairs on a class, an interval covers the true "
             "difference in far fewer than 95 % of cases: it is an indication only."
         )
-    if (rows.pairs > rows.instances).any():
-        caveats.append(
-            "Several pairs share an instance: such runs are not independent draws of the task, so "
-            "the interval is too narrow for other instances."
-        )
-    return caveats
+    return [*caveats, *([_SHARED] if _share(rows) else [])]
+
+
+def _share(rows: pd.DataFrame) -> bool:
+    return "instances" in rows and bool((rows.pairs > rows.instances).any())
 
 
 def implementation_caveats(plan: StudyPlan, names: Collection[str]) -> list[str]:
@@ -343,6 +346,8 @@ def _caption(layout: Layout, rows: pd.DataFrame) -> str:
     what = re.match("IQM over ((?:pairs of )?)(runs|lives)", layout.note)
     if what is None or "low" not in rows:
         return ""
+    if "reference" in rows:
+        rows = rows[rows.reference.isna()]
     counts = rows["pairs" if what[1] else "runs"][rows.get("class_name", "") != ALL]
     few, many = int(counts.min()), int(counts.max())
     n = f"{few}" if few == many else f"{few} to {many}"
@@ -351,7 +356,8 @@ def _caption(layout: Layout, rows: pd.DataFrame) -> str:
     if len(worse) == 1:
         caption += f"; {'lower' if worse == {1} else 'higher'} is better"
     marks = f" {_MARKS}" if _MARKS in layout.note else ""
-    return f"{caption}.{marks}" + (f" {_OF_FEW}" if few < ENOUGH_RUNS else "")
+    of_few = f" {_OF_FEW}" if few < ENOUGH_RUNS else ""
+    return f"{caption}.{marks}{of_few}" + (f" {_SHARED}" if _share(rows) else "")
 
 
 def _readable(analysis: Analysis) -> dict[str, pd.DataFrame]:

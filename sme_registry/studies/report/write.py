@@ -38,11 +38,7 @@ from sme_registry.plots.style import WRITTEN
 from sme_registry.studies.ledger import REPORT, Ledger
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.design import metrics_of
-from sme_registry.studies.report.figures import (
-    draw,
-    draw_differences,
-    draw_figures,
-)
+from sme_registry.studies.report.figures import draw, draw_differences, draw_figures
 from sme_registry.studies.report.figures.curves import draw_class_curves
 from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.findings import THRESHOLDS, findings
@@ -125,6 +121,11 @@ def write_report(
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
     analysis = analyse(file, results, failures, models=models)
     pages = explorers_of(ledger.folder, analysis) if explorers else []
+    if explorers and not pages:
+        raise OptionError(
+            f"explorers: {str(folder)!r} has no model of a run on a single task that can be shown. "
+            "Run the study with --keep-models, or leave it out."
+        )
     contents = _contents(analysis, formats, pages, full=full)
     return [write_atomically(target / name, content) for name, content in contents.items()]
 
@@ -327,22 +328,26 @@ def compare(
       >>> bool(differences["difference"].iloc[-1] < 0)
       True
     """
+    names: list[str] = []
     if not isinstance(study, StudyFrames):
-        if not Ledger(study).study_file().plan.classes:
+        plan = Ledger(study).study_file().plan
+        names = [algorithm.name for algorithm in plan.algorithms]
+        if not plan.classes:
             raise OptionError(
                 f"folder={str(study)!r}: its plan has streams alone, and runs on single tasks are "
                 "compared. `sme study report` has the differences between algorithms in streams."
             )
         study = load(study)
     finished = runs_of(study.results)
-    names = list(dict.fromkeys(finished.algorithm))
+    names = names or list(dict.fromkeys(finished.algorithm))
     for name in (first, second) if names else ():
         choice("algorithm", name, names, error=UnknownNameError)
     if first == second:
         raise OptionError(f"{first!r}: is given twice. Give two different algorithms.")
     known = {metric.key: metric for metric in metrics_of("run", finished.columns)}
-    chosen = [known[choice("metric", key, known, error=UnknownNameError)] for key in metrics]
-    table = frame([*differences(finished, [(first, second)], chosen)], DIFFERENCES)
+    chosen = {k: known[choice("metric", k, known, error=UnknownNameError)] for k in metrics}
+    rows = differences(finished, [(first, second)], [*chosen.values()])
+    table = frame([*rows], DIFFERENCES)
     if table.empty:
         raise OptionError(
             f"{first!r} and {second!r}: no class has a run of both on the same instance with the "

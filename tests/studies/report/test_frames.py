@@ -16,7 +16,7 @@ from sme_registry.studies.report.design import ALL, metrics_of
 from sme_registry.studies.report.frames import StudyFrames
 from sme_registry.studies.report.texts import comparison_tables
 from tests.commands import good
-from tests.studies.finished import rows_of
+from tests.studies.finished import rows_of, study_file
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +130,20 @@ def test_bad_names_are_refused(loaded, finished):
         studies.compare(finished, "Alpha", "Alpha")
 
 
+def test_a_metric_given_twice_is_compared_once(loaded):
+    table = studies.compare(loaded, "Alpha", "Beta", ["wd_regret", "wd_regret"])
+    assert comparison_tables(table)[0].frame["class"].is_unique
+
+
+def test_an_algorithm_of_the_plan_without_runs_is_known(finished, tmp_path):
+    for planned in study_file().plan.cells:
+        if planned.algorithm == "Alpha":
+            Ledger(tmp_path).write(Ledger(finished).result(planned.cell.digest))
+    Ledger(tmp_path).write_plan(study_file())
+    with pytest.raises(OptionError, match="no class has a run of both"):
+        studies.compare(tmp_path, "Alpha", "Beta")
+
+
 def test_the_command_writes_tables_and_figures(finished, tmp_path):
     pytest.importorskip("matplotlib")
     command = ["study", "compare", str(finished), "Alpha", "Beta", "--out", str(tmp_path), "--json"]
@@ -169,7 +183,9 @@ def test_pairs_that_share_an_instance_are_no_independent_draws_of_the_task(loade
     shared = loaded.results.assign(spec_digest=loaded.results.class_name)
     table = studies.compare(StudyFrames(shared, loaded.curves), "Alpha", "Beta")
     assert set(table[table.class_name != ALL].instances) == {1}
-    assert "share an instance" in comparison_tables(table)[0].note
+    (text, _) = comparison_tables(table)
+    assert "share an instance" in text.note
+    assert "share an instance" in text.caption
 
 
 def test_all_classes_is_the_mean_of_the_classes(loaded):

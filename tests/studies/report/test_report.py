@@ -162,6 +162,7 @@ def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     ledger.write(result)
     (page,) = write_report(tmp_path, formats=["html"])
     assert "figure-maps" not in Page(page.read_text()).values("id")
+    assert "Run the study with --keep-models" in refused("study", "report", tmp_path, "--explorers")
     ledger.write(result, model.read_bytes())
     page, explorer = write_report(tmp_path, formats=["html"], explorers=True)
     assert "figure-maps" in Page(page.read_text()).values("id")
@@ -172,9 +173,9 @@ def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     good("diagnose", "--explore", tmp_path, "--cell", result.key, "--out", tmp_path / "one.html")
     assert (tmp_path / "one.html").read_text() == explorer.read_text()
     ledger.model_path(result.key).write_bytes(b"no model")
-    text = write_report(tmp_path, formats=["html"], explorers=True)[0].read_text()
-    assert "figure-maps" not in text
-    assert "explorers/" not in text
+    assert "figure-maps" not in write_report(tmp_path, formats=["html"])[0].read_text()
+    with pytest.raises(OptionError, match="no model of a run on a single task that can be shown"):
+        write_report(tmp_path, explorers=True)
 
 
 def test_other_formats_and_folders_without_a_study_or_results_are_refused(finished, tmp_path):
