@@ -28,7 +28,7 @@ from sme_registry.cli.task import ClassOptions
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
 from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.io import read_json
-from sme_registry.io.markup import Table
+from sme_registry.io.markup import Table, plural
 from sme_registry.io.system import available_cores
 from sme_registry.io.terminal import (
     count,
@@ -145,9 +145,10 @@ class PlanOptions(Budgets, ClassOptions):
 
     def plan(self, source: str) -> StudyPlan:
         """The plan that the options describe; errors name `source`."""
+        members = self.members()
         fields = {
-            **self.members(),
-            "algorithms": self._algorithms(),
+            **members,
+            "algorithms": self._algorithms(on_tasks=bool(members["classes"])),
             "evaluations": 100,
             "evaluation_episodes": self.evaluation_episodes,
             "protocol": resolve_protocol(self.protocol).to_dict(),
@@ -157,7 +158,7 @@ class PlanOptions(Budgets, ClassOptions):
         _check_different(plan.algorithms)
         return plan
 
-    def _algorithms(self) -> list[dict[str, Any]]:
+    def _algorithms(self, *, on_tasks: bool) -> list[dict[str, Any]]:
         """Each `[NAME=]USES` with each action range."""
         if not self.algorithm:
             raise OptionError("--algorithm: is required, such as --algorithm PPO.")
@@ -173,7 +174,7 @@ class PlanOptions(Budgets, ClassOptions):
                 "uses": uses,
                 "hyperparameters": nested_hyperparameters(settings.get(name, {})),
                 "action_range": action_range,
-                **({"steps": 0} if parse_uses(uses)[0] == "reference" else {}),
+                **({"steps": 0} if on_tasks and parse_uses(uses)[0] == "reference" else {}),
             }
             for name, uses in uses_of
             for action_range in ranges
@@ -265,6 +266,8 @@ def plan(
     file = with_sources(options.scaled(find_file(StudyFile, plan)))
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
+    if folder is not None:
+        Ledger(folder).study_file()  # or there is no study
     results = {} if folder is None else Ledger(folder).results()
     _warn(file.plan, planned, SMEError)
     estimator = Estimator(results.values())
@@ -299,7 +302,7 @@ def plan(
         return
     out().print(_plan_table(file, planned, estimator.seconds))
     finished = f", {done:,} of them finished" if results else ""
-    out().print(f"{len(cells):,} cells{finished}. Estimated time:")
+    out().print(f"{plural(len(cells), 'cell')}{finished}. Estimated time:")
     for place, n in workers.items():
         out().print(f"  {place + ':':32}about {duration(seconds(n))}")
     unmeasured = sorted({cell.uses for cell in waiting} - measured)
@@ -329,7 +332,8 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
         }
         rows.append(row)
     classes = unique(cell.class_name for cell in planned)
-    caption = f"{file.digest}\n{len(classes)} classes: {escape(', '.join(classes))}"
+    listed = f"{plural(len(classes), 'class', 'classes')}: {', '.join(classes)}"
+    caption = f"{file.digest}\n{escape(listed)}"
     title = f"[bold]{file.versioned_name}[/]  {escape(file.description)}"
     return Table.of(title, rows, caption=caption)
 

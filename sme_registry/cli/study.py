@@ -16,15 +16,9 @@ from sme_registry import studies
 from sme_registry.cli.arguments import Json, Out, find_file, unique, with_options
 from sme_registry.cli.plan import Budgets, Jobs, Only, PlanName, PlanOptions, new, plan
 from sme_registry.errors import OptionError
-from sme_registry.io.markup import Table
+from sme_registry.io.markup import Table, plural
 from sme_registry.io.system import available_cores
-from sme_registry.io.terminal import (
-    duration,
-    out,
-    print_json,
-    print_line,
-    print_note,
-)
+from sme_registry.io.terminal import duration, out, print_json, print_line, print_note
 from sme_registry.spec import StudyFile
 from sme_registry.studies.executors import EXECUTORS
 from sme_registry.studies.ledger import (
@@ -140,12 +134,7 @@ def check_complete(status: StudyStatus) -> None:
 
 
 @with_options
-def status(
-    folder: StudyFolder,
-    options: Budgets,
-    only: Only = None,
-    json: Json = False,
-) -> None:
+def status(folder: StudyFolder, options: Budgets, only: Only = None, json: Json = False) -> None:
     """Show how many cells are done, running, failed and waiting, and the time left.
 
     It changes nothing and may be used while the study runs. --steps, --seeds and --evaluations
@@ -164,8 +153,7 @@ def report(
     folder: StudyFolder,
     out_folder: Out = None,
     formats: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMATS", help="Any of these, separated by commas."),
+        str, typer.Option("--format", metavar="FORMATS", help="Any of these, separated by commas.")
     ] = "html,png,pdf,csv,latex",
     explorers: Annotated[
         bool,
@@ -174,8 +162,7 @@ def report(
         ),
     ] = False,
     full: Annotated[
-        bool,
-        typer.Option("--full", help="Also all figures and tables as files."),
+        bool, typer.Option("--full", help="Also all figures and tables as files.")
     ] = False,
 ) -> None:
     """Report which property of the task breaks an algorithm, and how certain that is.
@@ -223,7 +210,7 @@ def print_status(status: StudyStatus, json: bool) -> None:
     title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"
     out().print(Table.of(title, rows, caption="done · + running · ! failed · / all"))
     parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
-    out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")
+    out().print(f"{plural(len(status.cells), 'cell')}: {', '.join(parts)}")
     if status.seconds_left > 0:
         here = available_cores()
         one, all_here = (duration(status.seconds_left / cores) for cores in (1, here))
@@ -312,11 +299,7 @@ def compare(
 
 
 @with_options
-def sweep(
-    folder: NewFolder,
-    options: PlanOptions,
-    jobs: Jobs = None,
-) -> None:
+def sweep(folder: NewFolder, options: PlanOptions, jobs: Jobs = None) -> None:
     """Vary a field of a task, run an algorithm on each value, and draw regret against the value.
 
     One command for `study new --sweep`, `study run` and `study report`. Interrupt it at any time

@@ -135,6 +135,8 @@ class ClassOptions:
             raise OptionError("--sweep: needs exactly one --task, and no --suite.")
         if self.suite is None and not documents:
             raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
+        if instances > 1 and not documents:
+            raise OptionError(f"instances={instances}: is for --task. Leave it out with --suite.")
         classes: list[SuiteClass] = []
         streams: list[StreamClass] = []
         if self.suite is not None:

@@ -382,10 +382,12 @@ EXECUTORS: dict[str, type[Executor]] = {
 """The executors by name, as `run_study` and `sme study run` take it."""
 
 
-def executor_type(name: str | None, ray: str | None) -> type[Executor]:
+def executor_type(name: str | None, ray: str | None, jobs: int | None) -> type[Executor]:
     """The executor of a name; by default Ray where its address is given, else processes."""
-    name = name or ("processes" if ray is None else "ray")
+    name = str(name or ("processes" if ray is None else "ray"))
     choice("executor", name, EXECUTORS, error=UnknownNameError)
     if ray is not None and name != "ray":
         raise OptionError(f"ray={ray!r}: contradicts executor={name!r}. Leave one out.")
+    if jobs not in (None, 1) and name == "in-process":
+        raise OptionError(f"jobs={jobs}: must be 1 with executor={name!r}. Leave it out.")
     return EXECUTORS[name]

@@ -83,7 +83,7 @@ class Ledger:
         if other_files:
             raise OptionError(
                 f"folder={str(self.folder)!r}: contains files that belong to no study, such as "
-                f"{min(other_files)!r}. Give an empty or a new folder."
+                f"{min(other_files)!r}. Give the folder of a study, or a new one."
             )
         return None
 

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from sme_registry.errors import OptionError
 from sme_registry.io import Lock, integer_in
+from sme_registry.io.markup import plural
 from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell
@@ -89,7 +90,7 @@ def run_study(
 
     check_algorithms(plan_file.plan, checked, say)
     if not isinstance(executor, Executor):
-        executor = executor_type(executor, ray)(jobs, run, keep_models, ray)
+        executor = executor_type(executor, ray, jobs)(jobs, run, keep_models, ray)
     programs = _programs(plan_file.plan, checked, device, lanes, local=executor.local)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
@@ -289,7 +290,7 @@ class _StudyRun:
 
     def announce(self) -> None:
         queue, cells = self._queue, len(self._queue.planned)
-        parts = [f"{cells:,} cells"]
+        parts = [plural(cells, "cell")]
         if queue.finished:
             parts.append(f"{queue.finished:,} finished before and reused")
         skipped = cells - queue.finished - len(queue.waiting)

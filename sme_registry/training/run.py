@@ -297,8 +297,7 @@ def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None
     if num_envs not in (None, 1):
         raise OptionError(
             f"num_envs={num_envs!r}: must be 1 on a stream, since each environment would live a "
-            "life of its own, and for algorithms that are not of Stable-Baselines3's kind. Leave "
-            "it out."
+            "life of its own, and for an algorithm outside Stable-Baselines3. Leave it out."
         )
     return 1
 

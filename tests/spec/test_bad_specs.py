@@ -56,7 +56,7 @@ BAD = [
     ),
 ]
 BAD_AGENTS = [
-    ([], "team.agents=[]: Tuple must have at least 1 item"),
+    ([], "team.agents=[]: must have at least 1 item, not 0."),
     ([{"action_dim": 3}], "team.agents: their action channels add up to 3 … action_dim=4"),
     (
         [ONE, {"action_dim": "2"}],

@@ -136,7 +136,7 @@ ZEROS = "sha256:" + "0" * 64
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ([], "phases=[]: Tuple must have at least 1"),
+        ([], "phases=[]: must have at least 1 item, not 0. Correct it."),
         ([phase(0)], "phases.0.steps=0: must be in [1"),
         ({"phases": [phase(1)], "cycles": 0}, "cycles=0"),
         ([phase(1), {"spec": "Defult", "steps": 1}], "phases.1.spec='Defult'"),
