@@ -25,15 +25,7 @@ from sme_registry.datasets.documents import PolicyScore
 from sme_registry.datasets.storage import check_location, datasets_folder, list_datasets
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import (
-    Progress,
-    count,
-    err,
-    out,
-    print_json,
-    print_note,
-    print_pairs,
-)
+from sme_registry.io.terminal import Progress, count, err, out, print_json, print_note, print_pairs
 from sme_registry.spec import catalogue
 from sme_registry.task import materialize
 

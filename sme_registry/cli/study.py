@@ -278,11 +278,7 @@ def compare(
     """
     from sme_registry.studies.report import write
     from sme_registry.studies.report.frames import records
-    from sme_registry.studies.report.texts import (
-        comparison_tables,
-        difference_caveats,
-        implementation_caveats,
-    )
+    from sme_registry.studies.report.texts import comparison_caveats, comparison_tables
 
     differences = write.compare(folder, first, second, metric or write.DEFAULT_METRICS)
     files = [] if out_folder is None else write.write_comparison(folder, out_folder, differences)
@@ -291,8 +287,7 @@ def compare(
         return
     for each in comparison_tables(differences, verdicts=True):
         out().print(Table.of(f"[bold]{escape(each.title)}[/]", each.frame.to_dict("records")))
-    caveats = implementation_caveats(Ledger(folder).study_file().plan, (first, second))
-    for sentence in (*difference_caveats(differences), *caveats):
+    for sentence in comparison_caveats(Ledger(folder).study_file().plan, differences):
         print_line(escape(sentence))
     if files:
         print_line(f"{escape(str(out_folder))}  {len(files)} files")

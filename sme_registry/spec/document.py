@@ -89,7 +89,7 @@ def _explain(model: type[BaseModel], line: ErrorDetails) -> str:
             return f"{value}: {message}"
         return f"{path}.{message}" if path else message  # which names the model's field
     field = fields.get(str(location[-1])) if location else None
-    allowed = re.sub("^(Input|Tuple) should|should", "must", line["msg"], count=1)
+    allowed = re.sub("^(Input|Tuple|String) should|should", "must", line["msg"], count=1)
     allowed = allowed.replace(" after validation", "")
     if kind == "string_pattern_mismatch":
         allowed = f"must be {_words.get(line['ctx']['pattern'], allowed)}"

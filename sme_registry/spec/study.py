@@ -23,16 +23,14 @@ from sme_registry.spec.document import (
     SchemaVersion,
     StrictModel,
     check_names,
+    matching,
     short_repr,
 )
 from sme_registry.spec.sme_spec import ActionRange, Setting, SMESpec
 from sme_registry.spec.stream import Phase, StreamSpec
-from sme_registry.spec.suite import (
-    EvaluationProtocol,
-    Suite,
-    SuiteClass,
-)
+from sme_registry.spec.suite import EvaluationProtocol, Suite, SuiteClass
 
+_NAME = r"^[A-Za-z0-9 ._+()-]+$"  # of an algorithm
 FRESH_EVALUATIONS = 10  # at most, of a fresh agent
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 
@@ -61,7 +59,7 @@ class StudyAlgorithm(StrictModel):
 
     fields_added_later: ClassVar[tuple[str, ...]] = ("source",)
 
-    name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9 ._+()-]+$")]
+    name: Annotated[str, matching(_NAME, "letters, digits, spaces and . _ + ( ) -", max_length=64)]
     uses: Annotated[str, Field(min_length=1, max_length=200)]
     hyperparameters: dict[str, JsonValue] = Field(default_factory=dict)
     action_range: ActionRange = "symmetric"

@@ -105,9 +105,6 @@ class Ledger:
         """Results by key: of all files in the folder, or of these keys, in their order."""
         return self._read(CellResult, keys)
 
-    def failure(self, key: str) -> CellFailure | None:
-        return self.failures([key]).get(key)
-
     def failures(self, keys: Iterable[str] | None = None) -> dict[str, CellFailure]:
         return self._read(CellFailure, keys)
 

@@ -266,7 +266,7 @@ class Queue:
         with contextlib.ExitStack() as stack:
             stack.enter_context(lock)
             self._ledger.set_aside(key)
-            entry = self._ledger.result(key) or self._ledger.failure(key)
+            entry = self._ledger.result(key) or self._ledger.failures([key]).get(key)
             if entry is None or entry == self._failures.get(key):
                 stack.pop_all()
                 return lock

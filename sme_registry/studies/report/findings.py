@@ -41,7 +41,7 @@ from sme_registry.studies.report.design import (
     setting_label,
 )
 from sme_registry.studies.report.frames import frame
-from sme_registry.studies.report.texts import implementation_caveats
+from sme_registry.studies.report.texts import implementation_caveats, steps_caveats
 
 COLUMNS = (
     "section:str algorithm:str class_name:str question:str verdict:str value low high runs:Int64 "
@@ -218,15 +218,14 @@ def _comparison(analysis: Analysis) -> Found:
     rows = analysis.rows("aggregates", **over_all, statistic="iqm").itertuples()
     learners = [row for row in rows if row.algorithm in analysis.learners]
     data = training_data(analysis.runs)
-    best: dict[str, Any] = {}
+    best: set[str] = set()
     for source in dict.fromkeys(data[row.algorithm] for row in learners):
         alike = [row for row in learners if data[row.algorithm] == source]
+        if len(alike) == 1:
+            continue
         row = max(alike, key=lambda row: row.value)  # of 1 − regret
-        if len(alike) > 1:
-            regret = {"value": 1 - row.value, "low": 1 - row.high, "high": 1 - row.low}
-            best[row.algorithm] = row._replace(**regret)
-    for name, row in best.items():
-        source = data[name]
+        row = row._replace(value=1 - row.value, low=1 - row.high, high=1 - row.low)
+        best.add(name := row.algorithm)
         of_data = f" of those with data of ν = {source[0]:g}" if source else ""
         yield finding(
             "comparison", "best", _of_few("best", row.fewest_runs),
@@ -236,7 +235,7 @@ def _comparison(analysis: Analysis) -> Found:
             row,
         )  # fmt: skip
     for row in analysis.rows("improvements", **over_all).itertuples():
-        if {row.first, row.second} & {*best} and {row.first, row.second} <= {*analysis.learners}:
+        if {row.first, row.second} & best and {row.first, row.second} <= {*analysis.learners}:
             yield finding(
                 "comparison", "improvement", _side(row, row.fewest_runs, 0.5),
                 f"A run of {row.first} beats one of {row.second} with probability "
@@ -387,11 +386,8 @@ def _stuck(runs: pd.DataFrame) -> Found:
 
 def _unlike(analysis: Analysis, section: str) -> Found:
     """In what else algorithms and classes differ."""
-    steps = dict(zip(analysis.runs.algorithm, analysis.runs.steps.tolist(), strict=True))
-    steps = {name: steps[name] for name in analysis.learners}
-    if len(set(steps.values())) > 1:
-        listed = ", ".join(f"{name} {count:,}" for name, count in steps.items())
-        yield finding(section, "training steps", "differ", f"Training steps differ: {listed}.")
+    for text in steps_caveats(analysis.plan, analysis.learners):
+        yield finding(section, "training steps", "differ", text)
     init = {name: info.setting["policy_init"] for name, info in analysis.classes.items()}
     other = [
         name

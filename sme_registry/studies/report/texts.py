@@ -313,6 +313,21 @@ def implementation_caveats(plan: StudyPlan, names: Collection[str]) -> list[str]
     return caveats
 
 
+def steps_caveats(plan: StudyPlan, names: Collection[str]) -> list[str]:
+    """A sentence if those of these algorithms that learn train for different numbers of steps."""
+    known = [a for a in plan.algorithms if a.name in names and not a.uses.startswith("reference:")]
+    steps = {a.name: plan.steps if a.steps is None else a.steps for a in known}
+    listed = ", ".join(f"{name} {count:,}" for name, count in steps.items())
+    return [f"Training steps differ: {listed}."] if len({*steps.values()}) > 1 else []
+
+
+def comparison_caveats(plan: StudyPlan, rows: pd.DataFrame) -> list[str]:
+    """Those of the result of `compare`."""
+    both = {*rows["first"], *rows["second"]}
+    caveats = *implementation_caveats(plan, both), *steps_caveats(plan, both)
+    return [*difference_caveats(rows), *caveats]
+
+
 def laid_out(layout: Layout, rows: pd.DataFrame, order: Sequence[str] = ()) -> Iterator[TextTable]:
     """A long table as text; columns are in an order, or in that of the rows."""
     for value, part in rows.groupby(layout.each, sort=False) if layout.each else [("", rows)]:

@@ -31,7 +31,7 @@ def test_a_result_is_read_back_as_it_was_and_ends_the_failure_before_it(tmp_path
     ledger = Ledger(tmp_path / "study")
     assert ledger.results() == {}
     ledger.write(failed(CELL))
-    assert ledger.failure(CELL.digest) == failed(CELL)
+    assert ledger.failures([CELL.digest]) == {CELL.digest: failed(CELL)}
     ledger.write(result, b"a model")
     assert ledger.result(CELL.digest) == result
     assert ledger.results() == ledger.results([OTHER.digest, CELL.digest]) == {CELL.digest: result}

@@ -7,8 +7,10 @@ import re
 
 import pytest
 
+from sme_registry.studies.budget import scaled
 from sme_registry.studies.report.analysis import ENOUGH_RUNS, change_verdict
 from sme_registry.studies.report.findings import findings
+from sme_registry.studies.report.texts import comparison_caveats
 from tests.studies.finished import analysed, found, rows_of, with_tables
 
 pytest.importorskip("matplotlib")
@@ -145,10 +147,13 @@ def test_an_improvement_is_judged_by_its_interval_against_a_half(analysis, ends,
 
 def test_different_training_steps_are_reported(analysis):
     assert "training steps" not in found(analysis)
-    runs = analysis.runs.copy()
-    runs.loc[runs.algorithm == "Alpha", "steps"] = 4000
-    steps = found(dataclasses.replace(analysis, runs=runs))["training steps"]
+    plan = scaled(analysis.file, steps_of={"Alpha": 4000})
+    steps = found(dataclasses.replace(analysis, file=plan))["training steps"]
     assert steps.sentence == "Training steps differ: Alpha 4,000, Beta 40."
+    for second in ("Beta", "constant"):
+        of_pair = rows_of(analysis.tables["differences"], first="Alpha", second=second)
+        caveats = comparison_caveats(plan.plan, of_pair)
+        assert (steps.sentence in caveats) == (second == "Beta")
 
 
 def text_of(analysis):
