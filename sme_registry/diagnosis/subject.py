@@ -24,6 +24,8 @@ from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.policies import TeamPolicy, as_policy
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.task import load
 from sme_registry.training import record as run_files
 from sme_registry.training.algorithms import backend_of, find, parse_uses
 from sme_registry.training.numpy_policy import numpy_policy
@@ -88,21 +90,22 @@ def perceptron_of(policy: Policy) -> Perceptron | None:
 
 def load_policy(
     policy: Any,
-    spec: SMESpec,
+    spec: SpecLike,
     *,
     action_range: str | None = None,
     name: str | None = None,
     log: str | Path | None = None,
 ) -> Subject:
-    """A policy in any form that `evaluate` accepts, and its task.
+    """A policy in any form that `evaluate` accepts, and its task: a spec, a name or a path.
 
     `log` is the episodes.csv of its training, as `sme train` and `wrappers.RecordRegret` write it.
 
     Examples:
       >>> from sme_registry.diagnosis import load_policy
-      >>> load_policy("linear", sme_registry.load("Default")).name
+      >>> load_policy("linear", "Default").name
       'linear'
     """
+    spec = load(spec, SMESpec)
     if spec.team is not None and log is not None:
         raise OptionError("log: of a team is not used. Leave it out.")
     if spec.team is None and isinstance(policy, str | Path) and str(policy).endswith(".zip"):

@@ -146,7 +146,7 @@ def facts(
     if isinstance(subject, StreamSubject):
         raise OptionError(
             f"run={subject.name!r}: is a life in a stream, and an explorer shows one policy on one "
-            "task. Give the model of one visit, such as RUN/snapshots/visit-0.zip, with --task "
+            "task. Give the model of one visit, such as RUN/snapshots/visit-00.zip, with --task "
             "FILE, the task of its phase."
         )
     spec, run = (subject, None) if isinstance(subject, SMESpec) else (subject.spec, subject)

@@ -56,6 +56,13 @@ def answers(diagnosis):
     return {verdict.question: verdict.answer for verdict in diagnosis.verdicts}
 
 
+def test_the_task_of_a_policy_may_be_a_name():
+    team = load_policy(reference_policy("optimal", load("Team2")), "Team2")
+    assert team.spec == load("Team2")
+    with pytest.raises(UnknownNameError, match="Did you mean"):
+        load_policy("optimal", "Teem2")
+
+
 def test_an_unknown_agent_of_a_team_is_refused(one_fails):
     with pytest.raises(UnknownNameError, match=r"must be 'scout_0', .* Did you mean 'driver_"):
         one_fails.agent("driver_2")

@@ -370,6 +370,7 @@ def test_a_result_of_another_cell_is_a_failure(study):
     [
         ({"executor": "threads"}, UnknownNameError, "must be 'processes', 'in-process' or 'ray'"),
         ({"only": ["class"]}, OptionError, "class=GLOB"),
+        ({"executor": "in-process", "jobs": 2}, OptionError, "^jobs=2: must be 1 with"),
         ({"device": "cpu"}, OptionError, "^device=.*no cell to run has one. Leave it out, or"),
         ({"lanes": 3}, OptionError, "^lanes=.*no cell to run has one. Leave it out, or"),
     ],
