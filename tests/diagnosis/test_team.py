@@ -73,7 +73,8 @@ def test_a_team_has_words_for_the_terminal_a_pipe_and_a_notebook_which_runs_no_h
     lines = printed(one_fails, details=True)
     assert any(line.startswith("blame: yes, ") for line in lines)
     assert max(map(len, lines)) <= 100
-    assert one_fails.headline().startswith("driver_1 is to blame: ")
+    start = "driver_1 is to blame for 100% of the regret, with 40% of the action channels: in the "
+    assert one_fails.headline().startswith(start)
     assert "| driver_1 |" in one_fails.markdown(["who_agents.png"])
     page = one_fails.model_copy(update={"name": "<script>![i](http://e)"})._repr_markdown_()
     assert page.startswith("# &lt;script>![i]\\(http://e) on ")

@@ -13,12 +13,7 @@ import pandas as pd
 from sme_registry.evaluation.retention import LABELS
 from sme_registry.io.markup import conjunction, escape_latex, fixed, signed
 from sme_registry.spec import StudyPlan
-from sme_registry.studies.report.analysis import (
-    ENOUGH_RUNS,
-    OFFLINE_INTERVAL,
-    TABLES,
-    Analysis,
-)
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, OFFLINE_INTERVAL, TABLES, Analysis
 from sme_registry.studies.report.design import ALL, METRICS, OUTSIDE, WITHIN
 from sme_registry.training.algorithms import AGENTS, BACKENDS, parse_uses
 
