@@ -362,6 +362,8 @@ def _caption(layout: Layout, rows: pd.DataFrame) -> str:
     few, many = int(counts.min()), int(counts.max())
     n = f"{few}" if few == many else f"{few} to {many}"
     caption = f"IQM over {n} {what[1]}{what[2]}, with 95 % bootstrap interval"
+    if many == 1:
+        caption = f"Single {what[1]}{what[2]}, without intervals"
     worse = {METRICS[metric].worse for metric in rows.metric}
     if len(worse) == 1:
         caption += f"; {'lower' if worse == {1} else 'higher'} is better"

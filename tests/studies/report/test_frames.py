@@ -119,6 +119,8 @@ def test_a_single_pair_has_no_interval(loaded):
     table = studies.compare(first, "Alpha", "Beta")
     assert table.low.isna().all()
     assert set(table.verdict) == {"open"}
+    caption = comparison_tables(table)[0].caption
+    assert caption.startswith("Single pairs of runs, without intervals; lower is better.")
 
 
 def test_bad_names_are_refused(loaded, finished):
