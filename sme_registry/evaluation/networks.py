@@ -135,6 +135,7 @@ class OfflinePolicy(Perceptron):
     """
 
     kind: ClassVar[str] = "sme-offline-policy"
+    action_range: ClassVar[str] = "unit"
     _output: ClassVar[str] = "tanh"
 
     def __init__(

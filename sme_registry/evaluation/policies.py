@@ -319,9 +319,14 @@ def _prepare(
             "torch.nn.Module, a Stable-Baselines3 model, the path of a .zip, .onnx or .npz file, "
             f"module:function, or the name of a reference policy. {interface.hint}".rstrip()
         )
+    name, own = name or _name_of(policy), getattr(policy, "action_range", None)
+    if (action_range, own) == ("symmetric", "unit"):
+        raise PolicyError(
+            f"action_range='symmetric': the actions of policy {name!r} are in [0, 1]. Leave it out."
+        )
     return Policy(
-        name=name or _name_of(policy),
-        action_range=action_range or getattr(policy, "action_range", None) or "unit",
+        name=name,
+        action_range=action_range or own or "unit",
         action_dim=interface.action_dim,
         hint=interface.hint,
         **functions,

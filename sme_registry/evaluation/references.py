@@ -168,6 +168,7 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
             return joint(s)[:, owned]
 
         act.__name__ = name
+        act.action_range = "unit"  # type: ignore[attr-defined]
         return act
 
     agents = zip(task.names, task.observed, task.owned, strict=True)

@@ -50,6 +50,8 @@ def test_a_saved_policy_is_read_again_to_the_bit_and_scores_alike(tmp_path):
     assert live.action_range == "unit"
     assert of_file.regions == live.regions
     for other in (saved, path):
+        with pytest.raises(PolicyError, match=r"actions of policy '\w+' are in \[0, 1\]"):
+            evaluate(other, SPEC, {"states_per_region": 50}, action_range="symmetric")
         with pytest.raises(PolicyError, match=r"its observations have shape \(4,\): must be \(10"):
             evaluate(other, SMESpec(), {"states_per_region": 50})
 

@@ -75,6 +75,8 @@ def test_symmetric_actions_are_rescaled():
     assert symmetric.regions == evaluated(constant(0.25, 1.0)).regions
     with pytest.raises(OptionError, match="action_range='wide': must be 'unit' or 'symmetric'"):
         evaluated(constant(0.5, 0.5), action_range="wide")
+    with pytest.raises(PolicyError, match=r"actions of policy 'linear' are in \[0, 1\]. Leave it"):
+        evaluated("linear", action_range="symmetric")
 
 
 @pytest.mark.parametrize("reference", references.NAMES)
