@@ -224,8 +224,8 @@ def _without_ranking(report: CriticReport) -> Decision:
 
 @_critic(
     yes="critic_ahead_of_actor",
-    no="actor_follows critic_ranks_badly critic_between critic_of_states",
-    unclear="rewards_alike",
+    no="actor_follows critic_ranks_badly critic_between",
+    unclear="critic_of_states rewards_alike",
     thresholds="ranks_well ranks_badly actor_lags",
 )
 def _critic_ranking(run: TaskDiagnosis, report: CriticReport) -> Decision:
@@ -243,8 +243,8 @@ def _critic_ranking(run: TaskDiagnosis, report: CriticReport) -> Decision:
 
 @_critic(
     yes="ranks_inside_only",
-    no="ranks_alike critic_of_states",
-    unclear="rewards_alike",
+    no="ranks_alike",
+    unclear="critic_of_states rewards_alike",
     thresholds="ranks_well ranks_badly",
 )
 def _critic_outside(_run: TaskDiagnosis, report: CriticReport) -> Decision:
@@ -258,13 +258,14 @@ def _critic_outside(_run: TaskDiagnosis, report: CriticReport) -> Decision:
 @_critic(
     yes="misled_by_discount",
     no="not_misled nothing_misleads",
-    unclear="neither_learnt",
+    unclear="neither_learnt critic_of_states rewards_alike",
     thresholds="ranks_well ranks_badly",
 )
-def _discount(_run: TaskDiagnosis, report: CriticReport) -> Decision:
+def _discount(run: TaskDiagnosis, report: CriticReport) -> Decision:
     cube = report.region("WD")
     if cube.misled_ranking is None or cube.ranking is None:
-        return Decision("nothing_misleads", {})
+        unshaped = run.spec.shaping is None
+        return Decision("nothing_misleads", {}) if unshaped else _without_ranking(report)
     evidence = {**cube.model_dump(include={"ranking", "misled_ranking"}), "gamma": report.gamma}
     if _badly(cube.ranking) and not _well(cube.misled_ranking):
         return Decision("neither_learnt", evidence)

@@ -185,6 +185,15 @@ def test_what_is_found_of_a_critic_has_its_verdict_and_a_sentence_with_numbers(
     assert len(verdict.sentence()) > 20
 
 
+@pytest.mark.parametrize("question", ["critic_ranking", "critic_outside", "discount"])
+def test_a_critic_of_states_rules_nothing_out(question):
+    shaped = DEEP.derive(shaping={"scale": 3})
+    critic_of_states = {"critic": report_of(ranking=None, outside=None)}
+    measured = diagnosis_of("linear", DEEP).measurements.model_copy(update=critic_of_states)
+    verdict = diagnosed(load_policy("linear", shaped), measured).verdict(question)
+    assert (verdict.answer, verdict.reason) == ("cannot tell", "critic_of_states")
+
+
 def test_a_diagnosis_of_a_model_has_its_critic_and_draws_it(figures, tmp_path):
     pytest.importorskip("matplotlib")
     spec = SMESpec(**SMALL, shaping={"scale": 3})
