@@ -21,6 +21,7 @@ from sme_registry.cli.arguments import (
     print_checks,
 )
 from sme_registry.datasets import Dataset, make_dataset, open_dataset, replay
+from sme_registry.datasets.collect import check_scores
 from sme_registry.datasets.documents import PolicyScore
 from sme_registry.datasets.storage import check_location, datasets_folder, list_datasets
 from sme_registry.errors import OptionError, SMEError
@@ -197,7 +198,7 @@ def check(
     folder: Folder = None,
     json: Json = False,
 ) -> None:
-    """Check data sets bit for bit: location, digests, and every transition recomputed by the task.
+    """Check data sets bit for bit: location, digests, every transition and its scores.
 
     Examples:
 
@@ -212,7 +213,9 @@ def _check(name: str, folder: Path | None) -> dict[str, Any]:
     try:
         dataset = open_dataset(name, folder)
         check_location(dataset, folder)
-        replay(dataset.transitions(), dataset.recipe, materialize(dataset.recipe.spec))
+        transitions, task = dataset.transitions(), materialize(dataset.recipe.spec)
+        replay(transitions, dataset.recipe, task)
+        check_scores(dataset.record.scores, task, transitions)
     except SMEError as error:
         return result | {"error": str(error)}
     return result | {"valid": True, "digest": dataset.record.arrays_digest}

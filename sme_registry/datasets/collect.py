@@ -33,7 +33,7 @@ from sme_registry.datasets.documents import (
 )
 from sme_registry.datasets.transitions import Arrays, Transitions
 from sme_registry.envs.batch import Batch
-from sme_registry.errors import OptionError
+from sme_registry.errors import DigestMismatchError, OptionError
 from sme_registry.evaluation.policies import TeamPolicy, as_policy
 from sme_registry.evaluation.regions import expansion
 from sme_registry.evaluation.rollouts import PlayStep, play
@@ -79,10 +79,7 @@ def _plain(task: Task) -> Task:
 
 
 def _optimal_policy(plain: Task, num_envs: int) -> Callable[[Array], Array]:
-    """π* from states `[B, S]` to `[B, A]`, with the same bits in any batch.
-
-    The next call but one overwrites its actions.
-    """
+    """π* `[B, A]`, with the same bits in any batch; the next call but one overwrites it."""
     batch, envs = Batch(plain, num_envs, reuse=True), np.arange(num_envs)
     observation, no_action = batch.observe(), np.zeros((num_envs, plain.spec.action_dim))
 
@@ -162,11 +159,7 @@ def _in_blocks(policy: Callable[[Observation], Array], observation: Observation)
 def play_episodes(
     task: Task, policy: BehaviourPolicy, seed: int | str, stream: str, episodes: range
 ) -> Iterator[tuple[PlayStep, Batch]]:
-    """The steps of whole episodes of a policy, and the batch after each.
-
-    The first numbers of an episode in the stream are its initial state. Actions are exactly as the
-    data set stores them: float32 in [0, 1].
-    """
+    """Whole episodes and the batch after each step; their first numbers are the initial states."""
     batch, envs = Batch(task, len(episodes)), np.arange(len(episodes))
     states = next(episode_numbers(seed, stream, episodes, task.spec.state_dim, ahead=1))
     batch.seed_by_states(envs, states)
@@ -347,12 +340,7 @@ def reference_scores(
     transitions: Transitions,
     policies: dict[int, Any] | None = None,
 ) -> ReferenceScores:
-    """The scores of a data set's behaviour, of the constant ½ and of the optimum.
-
-    In the data set's own states they are exact. By rollouts they are means over whole episodes with
-    their own starts, with standard errors. The optimum's return is T, unless shaping or a price is
-    paid on top: then its episodes are played, too.
-    """
+    """The scores of behaviour, constant ½ and optimum: exact in the states of the data set."""
     stream, T = "dataset/reference", recipe.spec.horizon
     count = min(_SCORED_EPISODES, _MAX_SCORED_STEPS // T)
 
@@ -387,6 +375,18 @@ def reference_scores(
         behaviours=tuple(behaviours),
         optimum=PolicyScore(similarity=1.0, step_reward=1.0, rollouts=optimum),
     )
+
+
+def check_scores(scores: ReferenceScores, task: Task, transitions: Transitions) -> None:
+    """Compare the scores in the states of a data set, which are exact, with its transitions."""
+    behaviour = transitions.similarities, transitions.step_rewards
+    for name, values in ("constant", _constant_values(task, transitions)), ("behaviour", behaviour):
+        for field, exact in _score(*values, None).model_dump(exclude={"rollouts"}).items():
+            if abs((stored := getattr(getattr(scores, name), field)) - exact) > 1e-9:
+                raise DigestMismatchError(
+                    f"scores.{name}.{field}={stored:.10g}: must be {exact:.10g}, the mean of the "
+                    "transitions. Download the data set again, or generate it again (--force)."
+                )
 
 
 def _score(similarity: Array, step_reward: Array, rollouts: EpisodeScores | None) -> PolicyScore:

@@ -20,6 +20,7 @@ from pydantic import Field, model_validator
 
 from sme_registry.errors import PolicyError, SpecError, UnknownNameError
 from sme_registry.io import choice, sha256_of
+from sme_registry.io.files import reason_of
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.blocks import Seed
 from sme_registry.spec.document import (
@@ -141,8 +142,13 @@ def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None =
     elif isinstance(policy, str) and policy == "random":
         fields = {"kind": "random", "weight": weight}
     elif isinstance(policy, str | os.PathLike):
-        path = Path(policy)
-        fields |= {"policy": path.stem, "sha256": _policy_digest(path)}
+        try:
+            fields |= {"policy": Path(policy).stem, "sha256": sha256_of(Path(policy).read_bytes())}
+        except (OSError, ValueError) as error:
+            raise PolicyError(
+                f"{policy}: cannot be read: {reason_of(error)}. Give the path of a saved model "
+                "(.zip or .onnx)."
+            ) from None
     elif callable(policy) or hasattr(policy, "predict"):
         name = getattr(policy, "__name__", type(policy).__name__)
         fields["policy"] = "policy" if name == "<lambda>" else name
@@ -152,16 +158,6 @@ def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None =
             "Stable-Baselines3 model, or the path of a .zip or .onnx file."
         )
     return Behaviour.from_dict(fields, "behaviour")
-
-
-def _policy_digest(path: Path) -> str:
-    try:
-        return sha256_of(path.read_bytes())
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise PolicyError(
-            f"{path}: cannot be read: {reason}. Give the path of a saved model (.zip or .onnx)."
-        ) from None
 
 
 _Share = Annotated[Real, Field(ge=0, le=1)]

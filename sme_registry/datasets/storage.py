@@ -214,13 +214,16 @@ def make_dataset(
         raise OptionError("nu, mix: give only one of them. `mix` accepts ν as a policy.")
     if action_range is not None:
         choice("action_range", action_range, ACTION_RANGES)
+    if isinstance(mix, str | float):
+        raise OptionError(f"mix={mix!r}: must be pairs of a policy and its share: [(0.5, 1)].")
     pairs = [(0.5 if nu is None else nu, 1.0)] if mix is None else list(mix)
+    behaviours = [parse_behaviour(policy, weight, action_range) for policy, weight in pairs]
+    if action_range is not None and all(b.kind != "policy" for b in behaviours):
+        raise OptionError(f"action_range={action_range!r}: is of policies in `mix`. Leave it out.")
     recipe = DatasetRecipe.from_dict(
         {
             "spec": load(spec_or_id, SMESpec),
-            "behaviours": [
-                parse_behaviour(policy, weight, action_range) for policy, weight in pairs
-            ],
+            "behaviours": behaviours,
             "transitions": transitions,
             "seed": seed,
             "coverage": coverage,

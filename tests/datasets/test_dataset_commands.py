@@ -1,12 +1,14 @@
 """The command `sme data`."""
 
+import copy
 import json
 import shutil
 
 import numpy as np
 import pytest
 
-from sme_registry.datasets import open_dataset
+from sme_registry.datasets import make_dataset, open_dataset
+from sme_registry.errors import OptionError
 from tests import commands
 
 NAME = "sme/Default-v1-nu50-seed7-v0"
@@ -104,6 +106,7 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
         (["--coverage", "-0.99"], "coverage=-0.99: 50 transitions"),
         (["--protocol", "paper-v9"], "'paper-v9': no protocol"),
         (["--action-range", "wide"], "action_range='wide': must be 'unit' or 'symmetric'"),
+        (["--action-range", "unit"], "action_range='unit': is of policies in `mix`. Leave it out."),
     ],
 )
 def test_invalid_input_gives_one_line_and_writes_nothing(arguments, message, tmp_path):
@@ -129,6 +132,11 @@ def test_a_copy_under_another_name_is_neither_listed_nor_valid(tmp_path):
     good("check", own, f"minari/{own}", f"backup/{own}")
 
 
+def test_a_mix_without_shares_is_refused():
+    with pytest.raises(OptionError, match="mix='random': must be pairs of a policy and its share"):
+        make_dataset("Default", mix="random")
+
+
 def test_broken_data_sets_are_named_and_the_others_are_listed_and_checked(tmp_path):
     import h5py
 
@@ -139,6 +147,15 @@ def test_broken_data_sets_are_named_and_the_others_are_listed_and_checked(tmp_pa
     result = commands.sme("data", "check", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json")
     assert result.exit_code == 2
     assert [checked["valid"] for checked in json.loads(result.stdout)] == [False, True, False]
+    document = tmp_path / "minari/sme/good-v0/data/metadata.json"
+    before = json.loads(document.read_text())
+    for name, field in (("behaviour", "similarity"), ("constant", "step_reward")):
+        after = copy.deepcopy(before)
+        after["sme"]["scores"][name][field] = 0.125
+        document.write_text(json.dumps(after))
+        printed = commands.sme("data", "check", "sme/good-v0").stdout
+        assert f"scores.{name}.{field}=0.125: must be" in " ".join(printed.split())
+    document.write_text(json.dumps(before))
     (tmp_path / "minari/sme/bad-v0/data/metadata.json").write_text("{")
     result = good("list")
     assert "sme/good-v0" in result.stdout
