@@ -217,6 +217,7 @@ def test_the_episodes_of_parallel_lanes_give_one_increasing_line():
         ("", "contains no finished episode"),
         ("a,b\n1,2\n", "must have numbers for step and regret"),
         ("step,regret\n1,x\n", "must have numbers for step and regret"),
+        ("step,regret\n1,nan\n", "must have numbers for step and regret"),
         (None, "cannot be read"),
     ],
 )

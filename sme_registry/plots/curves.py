@@ -231,7 +231,7 @@ def _points(run: Run, column: str) -> tuple[Array, Array]:
             rows = list(table)
             table = {name: [_field(row, name) for row in rows] for name in ("step", column)}
         step, values = (np.asarray(table[name], dtype=np.float64) for name in ("step", column))
-        if step.ndim != 1 or step.shape != values.shape:
+        if step.ndim != 1 or step.shape != values.shape or not np.isfinite(values).all():
             raise ValueError
     except (KeyError, AttributeError, TypeError, ValueError):
         raise OptionError(

@@ -24,6 +24,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import (
     Field,
     JsonValue,
@@ -199,12 +200,18 @@ def read_episodes(path: Path) -> list[Episode]:
             f"{_AGENT_PREFIX}<agent>, or for a task with safety {','.join(SAFETY)}."
         )
     episodes = []
-    for row in rows[1:]:
+    for line, row in enumerate(rows[1:], start=2):
         try:
             kinds = zip(_TYPES + (float,) * len(others), row, strict=True)
             values = [kind(text) for kind, text in kinds]
+            if not np.isfinite(values).all():
+                raise ValueError
         except ValueError:  # a number or a column is missing
-            break
+            if line == len(rows):
+                break
+            raise OptionError(
+                f"{path}: line {line} must have {len(head)} finite numbers. Correct it."
+            ) from None
         own, rest = values[: len(COLUMNS)], tuple(values[len(COLUMNS) :])
         episode = Episode._make((*own, (), EpisodeSafety(*rest) if others == SAFETY else None))
         episodes.append(episode._replace(agents_regret=rest) if by_agent else episode)
