@@ -50,6 +50,7 @@ from sme_registry.task import load
 
 _EVALUATION = "evaluation.json"
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
+_FORCE = "replaces what --out writes. Add --out, or leave it out"
 
 app = typer.Typer()
 
@@ -121,6 +122,7 @@ def evaluate(
     target = None if out_folder is None else out_folder / (STREAM if is_stream else _EVALUATION)
     if target is not None:
         check_new(target, force=force)
+    only_with(context, ("force",) if target is None else (), _FORCE)
     options: dict[str, Any] = {"action_range": action_range, "algorithm": algorithm}
     report: EvaluationReport | StreamReport
     policy: Policy | TeamPolicy | None = None
@@ -349,6 +351,7 @@ def diagnose(
     only_with(context, _OF_EXPLORE, "is for --explore. Add --explore, or leave it out")
     if out is not None:
         check_new(out / _JSON, force=force)
+    only_with(context, ("force",) if out is None else (), _FORCE)
     result = diagnosis.diagnose(
         subject.subject(run),
         against=None if against is None else subject.other(run, against),
@@ -394,12 +397,7 @@ def _write_page(
     elif options.task is None and not isinstance(subject, SMESpec):
         report = explorer.run_report(what)
     written = explorer.write_explorer(
-        target,
-        subject,
-        report=report,
-        channels=pairs,
-        episodes=episodes,
-        seed=seed,
+        target, subject, report=report, channels=pairs, episodes=episodes, seed=seed
     )
     print_written([written])
     return written

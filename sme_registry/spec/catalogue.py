@@ -205,8 +205,8 @@ def resolve(name: Any, kind: Any = None) -> Any:
         data = read_json(name)
         is_stream = kind is StreamSpec or (isinstance(data, dict) and StreamFile.content in data)
         file: Any = (StreamFile if is_stream else EnvFile).from_dict(data, str(name))
-        document, fingerprints = file.published
-        resolved = Resolved(document.named(file.name), fingerprints)
+        document, fingerprints, _ = file.published
+        resolved = Resolved(document.named(file.name), fingerprints, f"{name}: ")
     else:
         short = name.removeprefix("sme_registry:").removeprefix(f"{NAMESPACE}/")
         resolved = _of_name(short, kind)

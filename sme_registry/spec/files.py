@@ -102,6 +102,7 @@ class Resolved(NamedTuple, Generic[_D]):
 
     document: _D
     fingerprints: tuple[Fingerprint, ...] = ()  # of each phase's spec; none where there is no file
+    source: str = ""  # of the file of a path, as errors begin
 
 
 class EnvFile(Envelope):

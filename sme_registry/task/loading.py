@@ -78,7 +78,7 @@ def load(id_or_path_or_digest: Any, kind: Any = None) -> Any:
     """
     resolved = resolve(id_or_path_or_digest, kind)
     if resolved.fingerprints:
-        materialize_segments(resolved.document, resolved.fingerprints)
+        materialize_segments(*resolved)
     return resolved.document
 
 
@@ -103,8 +103,8 @@ def save(
       True
     """
     document = as_document(spec)
-    if Path(path).is_dir():
-        raise OptionError(f"{path}: is a folder. Give a file, such as {Path(path) / 'task.json'}.")
+    if Path(path).suffix != ".json" or Path(path).is_dir():
+        raise OptionError(f"{path}: must be a file that ends in .json, such as task.json.")
     with contextlib.suppress(SMEError):
         force = force or resolve(Path(path)).document == document
     check_new(path, force=force)
@@ -122,10 +122,7 @@ def save(
 
 
 def load_task(task: Task | SpecLike, **overrides: Any) -> Task:
-    """The task itself, or that of a name or spec; of a file it must have the file's fingerprint.
-
-    A derived task, with `overrides` of fields, has no published numbers.
-    """
+    """The task itself, or of a name or spec; if no field is overridden, it has its fingerprint."""
     if isinstance(task, Task) and not overrides:
         return task
     resolved = resolve(task, SMESpec)
@@ -134,14 +131,14 @@ def load_task(task: Task | SpecLike, **overrides: Any) -> Task:
 
 
 def materialize_segments(
-    document: SMESpec | StreamSpec, fingerprints: Sequence[Fingerprint] = ()
+    document: SMESpec | StreamSpec, fingerprints: Sequence[Fingerprint] = (), source: str = ""
 ) -> tuple[Task, ...]:
     """Draw and check the task of each segment of a cycle; equal specs share one."""
     tasks = materialize_together([segment.spec for segment in document.segments])
     drawn = {task.spec: task for task in tasks}
     for index, (spec, published) in enumerate(zip(document.specs, fingerprints, strict=False)):
         where = f"phases.{index}: " if isinstance(document, StreamSpec) else ""
-        check_fingerprint(published, drawn[spec], where)
+        check_fingerprint(published, drawn[spec], source + where)
     return tasks
 
 

@@ -100,7 +100,7 @@ def test_other_numbers_than_the_published_neither_load_nor_run(saved):
     first, second, third = good["next_state"]
     fragment = "next_state: differs by 2e-06"
     for next_state, words in (
-        ([first, [second[0], second[1], second[2] + 2e-6], third], f"fingerprint.{fragment}"),
+        ([first, [second[0], second[1], second[2] + 2e-6], third], f"json: fingerprint.{fragment}"),
         ([first, second], "next_state: has another shape"),
         ([first, second[:1], third], "next_state: has another shape"),
         ([["1e999", *first[1:]], second, third], "next_state: differs by inf"),
@@ -192,10 +192,10 @@ def test_saving_under_a_bad_name_writes_nothing(tmp_path):
     with pytest.raises(SpecError, match="name='my task': must be a string of 1 to 64 letters"):
         sme_registry.save(SMESpec(), tmp_path / "my task.json")
     assert list(tmp_path.iterdir()) == []
-    (tmp_path / "task").mkdir()
-    for force in (True, False):
-        with pytest.raises(OptionError, match=r"task: is a folder\. Give a file"):
-            sme_registry.save(SMESpec(), tmp_path / "task", force=force)
+    (tmp_path / "task.json").mkdir()
+    for force, name in ((True, "task.json"), (False, "task.json"), (False, "Deep16")):
+        with pytest.raises(OptionError, match=rf"{name}: must be a file that ends in \.json"):
+            sme_registry.save(SMESpec(), tmp_path / name, force=force)
 
 
 def test_only_force_replaces_the_file_of_another_task_and_whole(saved):
