@@ -51,11 +51,14 @@ def diagnose(
 
     Examples:
       >>> from sme_registry.diagnosis import diagnose, load_policy
-      >>> subject = load_policy("constant", sme_registry.load("Default"))
+      >>> subject = load_policy("constant", "Default")
       >>> diagnosis = diagnose(subject, states=64, episodes=8)
       >>> diagnosis.level
       'no_better_than_constant'
     """
+    for run in (subject, against or subject):
+        if not isinstance(run, AnySubject):
+            raise OptionError(f"{run!r:.60}: is no run. Give one of `load_run` or `load_policy`.")
     states = integer_in("states", states, 64, 1_000_000)
     episodes = integer_in("episodes", episodes, 8, 10_000)
     seed = integer_in("seed", seed, 0, 2**53 - 1)

@@ -223,11 +223,7 @@ def _log_of_episodes(path: Path) -> Log | None:
 def updates_of(
     uses: str, hyperparameters: Mapping[str, Any], steps: int, num_envs: int = 1
 ) -> int | None:
-    """How often an algorithm updated its networks; None where its hyperparameters do not tell.
-
-    An on-policy algorithm does so after each rollout, another one every `train_freq` steps after
-    `learning_starts`.
-    """
+    """How often an algorithm updated its networks, after rollouts or every `train_freq` steps."""
     name = parse_uses(uses)[1]
     if ":" in name:  # a reference, a learner of offline data or somebody's module
         return None

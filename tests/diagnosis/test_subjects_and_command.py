@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_run
+from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_policy, load_run
 from sme_registry.errors import DigestMismatchError, OptionError, PolicyError, UnknownNameError
 from sme_registry.studies.subject import load_cell
 from sme_registry.wrappers import RecordRegret
@@ -31,6 +31,9 @@ def test_what_cannot_be_diagnosed_is_rejected(tmp_path):
         load_run(tmp_path)
     with pytest.raises(OptionError, match="sme study run"):
         load_cell(tmp_path, "abcdef")
+    for subject, other in (("runs/a", None), (load_policy("linear", "Default"), "runs/a")):
+        with pytest.raises(OptionError, match=r"'runs/a': is no run\. Give one of `load_run` or"):
+            diagnose(subject, against=other)
     with pytest.raises(OptionError, match="states=63"):
         diagnosis_of(shrunk, states=63)
     with pytest.raises(OptionError, match="episodes=True"):
@@ -107,6 +110,7 @@ def test_the_command_accepts_any_policy_with_its_task(tmp_path):
     against = shown("linear", "-t", "Default", "--against", "constant")
     assert against["comparison"]["spec_fields"] == {}
     assert "--task Default" in refused("diagnose", "linear")
+    assert "Add --out" in refused("diagnose", "linear", "--task", "Default", "--force")
     assert "--task" in refused("diagnose", tmp_path, "--set", "k=1")
     assert "--cell" in refused("diagnose", tmp_path, "--cell", "a", "--task", "Default")
 
@@ -125,6 +129,11 @@ def test_a_policy_of_ones_own_loop_is_diagnosed_with_its_log(tmp_path):
     assert (training.rows, training.steps) == (4, 40)
     assert training.last_regret == pytest.approx(env.episodes[-1].regret)
     assert "--log" in refused("diagnose", tmp_path, "--log", path)
+    head, first, *others = path.read_text().splitlines()
+    for damaged in ("2,", "2,20,1,10,nan,0.5,0,0.1"):
+        path.write_text("\n".join([head, first, damaged, *others]))
+        refusal = refused("diagnose", "linear", "-t", "Default", "--log", path)
+        assert "line 3 must have 8 finite numbers" in refusal
     path.write_text("step,regret\n")
     assert "columns must be" in refused("diagnose", "linear", "-t", "Default", "--log", path)
 
