@@ -67,6 +67,7 @@ def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path):
     assert "--task" in refused("new", "other.json", "--sweep", "k=1,5")
     assert "--task" in refused("new", "other.json", "--instances", "2")
     assert "--k: is for a task" in refused("new", "other.json", "-t", "Default", "--k", "2")
+    assert "and --sweep" in refused("new", "other.json", "--sweep", "k=1,5", "--k", "2")
     assert (tmp_path / "mine.json").read_bytes() == before
     assert not (tmp_path / "other.json").exists()
     assert "is the file of a suite, not of a task" in refused("train", "mine.json")
@@ -517,6 +518,7 @@ class TestEvaluate:
         ]  # fmt: skip
         assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "constant"
         assert "--force" in refused("evaluate", "random", "Plane1", *QUICK, "--out", "ev")
+        assert "Add --out" in refused("evaluate", "random", "Plane1", *QUICK, "--force")
         assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "constant"
         good("evaluate", "random", "Plane1", *QUICK, "--out", "ev", "--force")
         assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "random"

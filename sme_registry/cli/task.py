@@ -223,9 +223,8 @@ def new(
     about: dict[str, Any] = {"description": description, "tags": tuple(tag or ())}
     texts = dataclasses.asdict(fields)
     if classes.task or classes.suite or classes.sweep:
-        only_with(
-            context, ("base", "agents", *texts), "is for a task. Leave out --task and --suite"
-        )
+        foreign = ("base", "agents", *texts)
+        only_with(context, foreign, "is for a task. Leave out --task, --suite and --sweep")
         suite = Suite.from_dict(classes.members())
         file = SuiteFile(name=name or path.stem, digest=suite.digest, suite=suite, **about)
         file.write(path)

@@ -190,10 +190,7 @@ def lifetime_in(options: dict[str, Any] | None) -> int | None:
 def initial_values(
     name: str, options: dict[str, Any], shape: tuple[int, ...], num_envs: int | None = None
 ) -> Array | None:
-    """The option `state` or `distractors` of a reset, as float64 of `shape`; None without it.
-
-    With `num_envs` B, one value for all or one for each; the result is `[B, *shape]`.
-    """
+    """The option `state` or `distractors` of a reset, `[*shape]` or `[B, *shape]`, or None."""
     if name not in options:
         return None
     if num_envs is None:
@@ -214,8 +211,8 @@ def initial_states(state: Any, shape: tuple[int, ...], name: str = "state") -> A
     outside = ~((array >= 0.0) & (array <= 1.0))
     if outside.any():
         raise StateError(
-            f"{name}: entry {array[outside][0]!r:.30} lies outside [0, 1]. An episode begins "
-            "inside the cube; to ask the task about values outside it, use env.unwrapped.task."
+            f"{name}: entry {array[outside][0]} lies outside [0, 1]. To ask the task about "
+            "values outside the cube, use env.unwrapped.task."
         )
     return array
 

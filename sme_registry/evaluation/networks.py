@@ -207,10 +207,7 @@ class OfflinePolicy(Perceptron):
 
 
 class OfflineCritic(OfflinePolicy):
-    """A critic that IQL learnt beside a policy: from (o, 2a − 1), `[B, O + A]`, to Q `[B, 1]`.
-
-    `about` also has the "discount" of its targets.
-    """
+    """A critic of IQL: (o, 2a − 1) to Q `[B, 1]`; `about` has the discount of its targets."""
 
     kind = "sme-offline-critic"
     _output = "identity"

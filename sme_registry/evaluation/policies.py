@@ -117,17 +117,11 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True)
 class TeamPolicy:
-    """A team's policies, ready to be called.
+    """A team's policies, ready to be called."""
 
-    Attributes:
-      name: what reports call it.
-      action_range: "unit" or "symmetric"; "mixed" if the agents' policies differ.
-      members: the agents, in the order of the channels that they own.
-    """
-
-    name: str
-    action_range: ActionRange | Literal["mixed"]
-    members: tuple[Member, ...]
+    name: str  # in reports
+    action_range: ActionRange | Literal["mixed"]  # mixed: the agents' policies differ
+    members: tuple[Member, ...]  # in the order of the channels that they own
     hidden: ClassVar[None] = None  # those of several networks
 
     def __call__(self, observations: Observation) -> Array:
@@ -222,10 +216,7 @@ def as_policy(
 
 
 def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
-    """The widths of a policy for a task; of a team's, for the one that all agents share.
-
-    `observed_phases` are the phases of a stream that the policy observes, for a single agent.
-    """
+    """The widths of a policy for a task; of a team's, for the one that all agents share."""
     if spec.team is None:
         S, A, m = spec.state_dim, spec.action_dim, spec.distractors
         distractors = f", {m} distractors" if m else ""

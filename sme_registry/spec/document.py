@@ -93,7 +93,7 @@ def _explain(model: type[BaseModel], line: ErrorDetails) -> str:
     allowed = allowed.replace(" after validation", "")
     if kind == "string_pattern_mismatch":
         allowed = f"must be {_words.get(line['ctx']['pattern'], allowed)}"
-    elif field is not None and (interval := _interval(field)):
+    elif field is not None and "too_" not in kind and (interval := _interval(field)):
         is_bound = kind.startswith(("greater_than", "less_than"))
         allowed = f"must be{interval}" if is_bound else allowed + interval
     if field is None or field.default is None or field.is_required():

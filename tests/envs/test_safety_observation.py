@@ -160,7 +160,7 @@ def test_distractors_that_cannot_be_used_are_refused_and_nothing_changes(make):
     for options, error, words in (
         ({"distractors": [0.5] * 7}, StateError, r"distractors of shape \(7,\).*\(8,\)"),
         ({"distractors": [1.5] * 8}, StateError, r"distractors: entry .*1\.5.* lies outside"),
-        ({"distractors": [np.nan] * 8}, StateError, "lies outside"),
+        ({"distractors": [np.nan] * 8}, StateError, "distractors: entry nan lies outside"),
         ({"distractors": "many"}, StateError, "must be an array of shape"),
         ({"distractors": None}, StateError, r"distractors of shape \(\)"),
         ({"distractor": [0.5] * 8}, OptionError, "Did you mean 'distractors'"),
