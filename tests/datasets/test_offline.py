@@ -186,7 +186,11 @@ def test_a_set_on_disk_provides_its_task_and_protocol(tmp_path):
         ({"evaluations": 41}, OptionError, r"evaluations=41: must be an integer in \[1, 40\]"),
         ({"hyperparameters": {"expectile": 0.7}}, SpecError, "expectile=0.7: unknown field"),
         ({"algorithm": "iql", "hyperparameters": {"expectile": 1.0}}, SpecError, "expectile=1.0"),
-        ({"hyperparameters": {"hidden": []}}, SpecError, r"hidden=\[\]: must have at least 1 item, not 0\. Correct"),
+        (
+            {"hyperparameters": {"hidden": []}},
+            SpecError,
+            r"hidden=\[\]: must have at least 1 item, not 0\. ",
+        ),
         ({"spec": SMESpec()}, OptionError, "observations of shape"),
         ({"spec": TINY.derive(seed=6)}, OptionError, "is not the task of the data set"),
         ({"spec": "Team2"}, SpecError, "team"),
