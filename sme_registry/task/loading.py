@@ -78,7 +78,7 @@ def load(id_or_path_or_digest: Any, kind: Any = None) -> Any:
     """
     resolved = resolve(id_or_path_or_digest, kind)
     if resolved.fingerprints:
-        materialize_segments(*resolved)
+        materialize_segments(resolved.document, resolved.fingerprints, resolved.source)
     return resolved.document
 
 
