@@ -102,8 +102,7 @@ def find_suite(name: str) -> SuiteFile:
     """A suite by its name in the catalogue, its file's path, or a board that has it."""
     if is_url(name) or os.path.isfile(os.path.join(name, BOARD)):
         return board_document(name).suite_file
-    is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
-    file = SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
+    file = catalogue.find(SuiteFile, name)
     refuse_unscored(file.suite)
     return file
 

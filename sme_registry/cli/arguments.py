@@ -77,7 +77,6 @@ KINDS: dict[str, type[Envelope]] = {
     "study": StudyFile,
 }
 
-_File = TypeVar("_File", bound=Envelope)
 _Value = TypeVar("_Value")
 
 
@@ -95,10 +94,6 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
         return EnvFile.from_dict(data, os.fspath(path))  # says that it is a bare spec
     contents = ", ".join(repr(kind.content) for kind in KINDS.values())
     raise MalformedDocumentError(f"{os.fspath(path)}: must be an object with one of {contents}.")
-
-
-def find_file(kind: type[_File], name: str) -> _File:
-    return kind.read(name) if is_path(name) else catalogue.find(kind, name)
 
 
 class Found(NamedTuple):

@@ -19,7 +19,6 @@ from sme_registry.cli.arguments import (
     assignments,
     changes,
     check_document_path,
-    find_file,
     only_with,
     unique,
     with_options,
@@ -263,7 +262,7 @@ def plan(
       sme study plan paper-ablations --steps 20000 --seeds 3 --only algorithm=PPO --only "class=k-*"
       sme study plan smoke --folder runs/smoke --json
     """
-    file = with_sources(options.scaled(find_file(StudyFile, plan)))
+    file = with_sources(options.scaled(catalogue.find(StudyFile, plan)))
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     if folder is not None:
@@ -398,7 +397,7 @@ def new(
         others = [option for option in context.params if option not in _ALLOWED_WITH_FROM]
         reason = "the plan of --from already sets it. Change it in that file, or leave out --from"
         only_with(context, others, reason)
-        data = read_json(source) if is_path(source) else find_file(StudyFile, source).to_dict()
+        data = read_json(source) if is_path(source) else catalogue.find(StudyFile, source).to_dict()
         named = isinstance(data, dict) and "name" in data
         file = StudyFile.with_digest(data, source, **({} if named else default_name) | about)
     # A package that is not installed here may be installed where the plan runs.

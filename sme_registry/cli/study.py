@@ -13,13 +13,13 @@ import typer
 from rich.markup import escape
 
 from sme_registry import studies
-from sme_registry.cli.arguments import Json, Out, find_file, unique, with_options
+from sme_registry.cli.arguments import Json, Out, unique, with_options
 from sme_registry.cli.plan import Budgets, Jobs, Only, PlanName, PlanOptions, new, plan
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table, plural
 from sme_registry.io.system import available_cores
 from sme_registry.io.terminal import duration, out, print_json, print_line, print_note
-from sme_registry.spec import StudyFile
+from sme_registry.spec import StudyFile, catalogue
 from sme_registry.studies.executors import EXECUTORS
 from sme_registry.studies.ledger import (
     PLAN,
@@ -107,7 +107,7 @@ def run(
       sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
     """
     status = run_study(
-        options.scaled(find_file(StudyFile, plan)),
+        options.scaled(catalogue.find(StudyFile, plan)),
         folder,
         executor=executor,
         jobs=jobs,

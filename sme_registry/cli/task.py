@@ -22,7 +22,6 @@ from sme_registry.cli.arguments import (
     assignments,
     check_document_path,
     find_any,
-    find_file,
     json_or_text,
     kind_of,
     only_with,
@@ -140,7 +139,7 @@ class ClassOptions:
         classes: list[SuiteClass] = []
         streams: list[StreamClass] = []
         if self.suite is not None:
-            suite = find_file(SuiteFile, self.suite).suite
+            suite = catalogue.find(SuiteFile, self.suite).suite
             classes, streams = [*suite.classes], [*suite.streams]
         for document in documents:
             name = _class_name(document)

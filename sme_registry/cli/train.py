@@ -16,7 +16,6 @@ from sme_registry.cli.arguments import (
     Json,
     Out,
     changes,
-    find_file,
     load_changed,
     only_with,
     print_training,
@@ -347,7 +346,7 @@ def _train_suite(context: typer.Context, options: Settings, name: str) -> None:
             f"--set {field}: is a field of the task, and the suite sets it. Write another suite "
             "with `sme new`, such as sme new suite.json -t task.json."
         )
-    file = find_file(SuiteFile, name)
+    file = catalogue.find(SuiteFile, name)
     suite = file.suite
     if not suite.classes:
         only_with(context, ("steps",), "is that of each stream here. Leave it out")

@@ -173,10 +173,7 @@ def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
         return EvaluationProtocol.from_dict(protocol)
     if not isinstance(protocol, str | os.PathLike):
         raise SpecError(f"protocol={protocol!r:.80}: must be a protocol, its name or its path.")
-    path = os.fspath(protocol)
-    if catalogue.is_path(path):
-        return ProtocolFile.read(path).protocol
-    return catalogue.find(ProtocolFile, path).protocol
+    return catalogue.find(ProtocolFile, protocol).protocol
 
 
 def versions_behind() -> dict[str, str]:

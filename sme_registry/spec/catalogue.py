@@ -92,8 +92,10 @@ def entries(kind: type[_E]) -> list[_E]:
     return [_read(kind, path) for path in paths(kind)]
 
 
-def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
-    """The file of a name, with or without its version (then the newest)."""
+def find(kind: type[_E], name: str | os.PathLike[str], others: Iterable[str] = ()) -> _E:
+    """The file of a path, or of a name, with or without its version (then the newest)."""
+    if isinstance(name, os.PathLike) or is_path(name):
+        return kind.read(name)
     if newest := _newest(kind, name):
         return cast(_E, _read(kind, spec_folder() / kind.folder / f"{newest}.json"))
     if name.endswith(POLICY_SUFFIXES):

@@ -15,7 +15,7 @@ from sme_registry.errors import OptionError
 from sme_registry.io import Lock, integer_in
 from sme_registry.io.markup import plural
 from sme_registry.io.terminal import Progress, err
-from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec import StudyFile, StudyPlan, catalogue
 from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.budget import selected, with_sources
 from sme_registry.studies.cell import run_cell
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def run_study(
-    plan_file: StudyFile,
+    plan_file: StudyFile | str | os.PathLike[str],
     folder: str | os.PathLike[str],
     *,
     executor: str | Executor | None = None,
@@ -56,6 +56,7 @@ def run_study(
     continues. Cells that another process is running are waited for. Results of earlier plans stay.
 
     Args:
+      plan_file: or the name of a plan in the catalogue, or the path of a plan's file.
       executor: "processes", one for each cell; "in-process"; "ray"; an `Executor`; or None for
         "processes", and with an address the executor of that.
       jobs: cells or programs at once; None for one per core, of this machine or of the cluster.
@@ -67,17 +68,15 @@ def run_study(
       run: runs a cell; for processes and Ray importable by name.
 
     Examples:
-      >>> from sme_registry.spec import StudyFile
       >>> from sme_registry.studies import run_study
-      >>> plan = StudyFile.read("study/plan.json")
-      >>> run_study(plan, "study", executor="in-process", progress=False).count("done")
+      >>> run_study("study/plan.json", "study", executor="in-process", progress=False).count("done")
       6
     """
     if jobs is not None:
         jobs = integer_in("jobs", jobs, 1)
     if lanes is not None:
         lanes = integer_in("lanes", lanes, 1, 100_000)
-    plan_file = with_sources(plan_file)
+    plan_file = with_sources(_file_of(plan_file))
     planned: dict[str, PlannedCell] = {}
     for place in selected(plan_file.plan.cells, only):
         planned.setdefault(place.cell.digest, place)
@@ -111,6 +110,12 @@ def run_study(
             f"{ledger.folder}. Run the same command to continue."
         ) from None
     return plan_status(ledger, plan_file, only)
+
+
+def _file_of(plan: StudyFile | str | os.PathLike[str]) -> StudyFile:
+    if not isinstance(plan, StudyFile | str | os.PathLike):
+        raise OptionError(f"plan_file={plan!r:.80}: must be a StudyFile, its name or its path.")
+    return plan if isinstance(plan, StudyFile) else catalogue.find(StudyFile, plan)
 
 
 def _programs(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sme_registry.errors import UnknownNameError
+from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan, catalogue
 from sme_registry.studies.budget import Estimator, in_implementation, scaled, selected
 from sme_registry.studies.cell import run_cell
@@ -143,13 +143,23 @@ class TestCommands:
         assert planned["estimated_from_results"] == ["reference:optimal"]
 
     def test_status_shows_what_is_done_what_failed_and_what_is_left(self, tmp_path):
-        file = small_file(seeds=3)
-        run_study(file, tmp_path / "s", executor="in-process", run=raising, progress=False)
+        path = small_file(seeds=3).write(tmp_path / "p.json")
+        run_study(path, tmp_path / "s", executor="in-process", run=raising, progress=False)
         text = good("status", "s")
         for words in ("2 !1 / 3", "3 cells: 2 done, 1 failed", "ValueError: this one is broken"):
             assert words in text
         text = good("status", "s", "--seeds", "5")
         assert "on one core" in text
+
+    def test_what_is_no_plan_is_refused(self, tmp_path):
+        for given, error in {
+            "Default": "is the name of",
+            "paper-ablation": "Did you mean",
+            3: "3",
+        }.items():
+            with pytest.raises((OptionError, UnknownNameError), match=error):
+                run_study(given, tmp_path / "s")
+        assert not (tmp_path / "s").exists()
 
     def test_a_new_plan_has_what_was_asked_for(self):
         options = ("--action-range", "unit", "--action-range", "symmetric", "--seeds", "4")
