@@ -103,8 +103,9 @@ def save(
       True
     """
     document = as_document(spec)
-    if Path(path).suffix != ".json" or Path(path).is_dir():
-        raise OptionError(f"{path}: must be a file that ends in .json, such as task.json.")
+    is_name = not str(path).endswith(".json") and os.sep not in str(path)  # to `load`
+    if Path(path).is_dir() or is_name:
+        raise OptionError(f"{path}: must be the path of a file, such as task.json.")
     with contextlib.suppress(SMEError):
         force = force or resolve(Path(path)).document == document
     check_new(path, force=force)
