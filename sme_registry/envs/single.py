@@ -143,9 +143,6 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         rows = self._schedule.columns.numbers.items()
         values = [(key, self._numbers[BUFFER_VALUES + row, ...]) for key, row in rows]
         self._values, self._more_values = values[:4], values[4:]
-        self._shaping = None  # the view of the shaping, where a task has this alone
-        if [key for key, _ in values[4:]] == ["shaping"] and not self._schedule.is_stream:
-            self._shaping, self._more_values = values[4][1], []
         self._rows: list[tuple[Array, Observation]] = []
         self._step: Callable[[Any, Any], _Result] = _check_running
         if self._status == "running":
@@ -153,7 +150,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     # Machine code cannot be pickled or copied: the copy looks it up again.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = {"_engine", "_buffer", "_values", "_more_values", "_shaping", "_rows", "_step"}
+        dropped = {"_engine", "_buffer", "_values", "_more_values", "_rows", "_step"}
         return {name: value for name, value in vars(self).items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -258,8 +255,9 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         more_to_do |= len(self._parts) > 1 or self._random.has_noise
         buffer, next_rows = self._buffer, self._rows.pop
         similarity, step_reward, regret, accumulated_reward = (view for _, view in self._values)
-        shaping, more_values = self._shaping, self._more_values
+        more_values = self._more_values
         phase, lifetimes, is_stream = self._phase, self._lifetimes, self._schedule.is_stream
+        is_plain = not (more_to_do or more_values)
 
         def step(env: SMEEnv, action: Any) -> _Result:
             try:
@@ -287,15 +285,6 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
                     "phase": phase,
                     "lifetime": lifetimes.pop(),
                 }
-            elif shaping is not None:
-                info = {
-                    "optimal_action": optimal,
-                    "similarity": similarity[()],
-                    "step_reward": step_reward[()],
-                    "regret": regret[()],
-                    "accumulated_reward": accumulated_reward[()],
-                    "shaping": shaping[()],
-                }
             else:
                 info = {
                     "optimal_action": optimal,
@@ -304,6 +293,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
                     "regret": regret[()],
                     "accumulated_reward": accumulated_reward[()],
                 }
+            if is_plain and lifetimes and not end:
+                return observation, reward, False, False, info
             for key, view in more_values:
                 info[key] = view[()]
             if end or more_to_do or not lifetimes:
