@@ -106,14 +106,14 @@ def profile(
       sme profile --runs runs/mine
       sme profile show PPO
     """
-    from sme_registry.profiles import page, run
-
     if subject == _SHOW:
         others = [option for option in context.params if option not in _WITH_SHOW]
         only_with(context, others, "is not for show. Leave it out")
         _show(name, json)
         return
     _check_subject(subject, name, algorithm, runs)
+    from sme_registry.profiles import page, run  # not to show: that takes no pages and no training
+
     if runs is not None:
         others = [option for option in context.params if option not in _WITH_RUNS]
         only_with(context, others, "is for a training, and --runs trains nothing. Leave one out")

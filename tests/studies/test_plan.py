@@ -155,7 +155,7 @@ class TestCommands:
         for given, error in {
             "Default": "is the name of",
             "paper-ablation": "Did you mean",
-            3: "3",
+            3: "plan_file=3: must be a StudyFile",
         }.items():
             with pytest.raises((OptionError, UnknownNameError), match=error):
                 run_study(given, tmp_path / "s")
