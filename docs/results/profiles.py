@@ -8,9 +8,9 @@ Agents are in JAX. The same command continues from the results in the folder (`-
 runs/profiles, which is not in the repository), also after a kill; programs that run save their
 state every three minutes. After `--minutes`, and after Ctrl-C, what has finished is written, so a
 part is kept by committing it: a whole profile is in `sme_registry/profiles/references/`, a part of
-one in `unfinished-profiles/` beside this script, and a class of which a file has every run is not
-run again. TD3 and SAC with γ = 0 run on the default, the reward interval and foresight alone. The
-pages follow with `python docs/generate.py` and `python docs/figures.py profiles`.
+one in `unfinished-profiles/` beside this script, and no run of either is run again. TD3 and SAC
+with γ = 0 run on the default, the reward interval and foresight alone. The pages follow with
+`python docs/generate.py` and `python docs/figures.py profiles`.
 """
 
 from __future__ import annotations
@@ -68,14 +68,20 @@ def main() -> None:
         places = [folder / f"{slug(name)}.json" for folder in (options.out, PARTS)]
         earlier = [Profile.read(place) for place in places if place.exists()]
         earlier = [profile for profile in earlier if profile.plan_digest == file.digest]
-        whole = {c for p in earlier for c in p.classes if len(p.values(c)) == p.seeds}
-        missing = [f"class={each}" for each in classes_of(name) if each not in whole]
+        known_runs = {(row.class_name, row.run) for profile in earlier for row in profile.rows}
+        missing: dict[tuple[int, ...], list[str]] = {}  # the classes that lack the same runs
+        for each in classes_of(name):
+            lacks = tuple(run for run in range(file.plan.seeds) if (each, run) not in known_runs)
+            missing.setdefault(lacks, []).append(each)
+        missing.pop((), None)
         try:
-            # Two classes at once, so that a part has whole classes.
-            for first in range(0, 0 if stopped else len(missing), 2):
-                only = [f"algorithm={name}", *missing[first : first + 2]]
-                sizes = {"jobs": options.jobs, "lanes": options.lanes}
-                run_study(file, options.folder, only=only, **sizes)
+            for runs, classes in [] if stopped else missing.items():
+                # Two classes at once, so that a part has whole classes.
+                for first in range(0, len(classes), 2):
+                    only = [f"algorithm={name}", *(f"run={run}" for run in runs)]
+                    only += [f"class={each}" for each in classes[first : first + 2]]
+                    sizes = {"jobs": options.jobs, "lanes": options.lanes}
+                    run_study(file, options.folder, only=only, **sizes)
         except KeyboardInterrupt as interrupt:
             print(interrupt)
             stopped = True

@@ -227,8 +227,8 @@ Only = Annotated[
     list[str] | None,
     typer.Option(
         metavar="KIND=GLOB",
-        help="Only cells that match class=GLOB or algorithm=GLOB. Repeatable: a cell must "
-        "match one pattern of each kind given.",
+        help="Only cells that match class=GLOB, algorithm=GLOB or run=GLOB (from 0). Repeatable: "
+        "a cell must match one pattern of each kind given.",
     ),
 ]
 Jobs = Annotated[

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from operator import attrgetter
 
@@ -37,7 +37,11 @@ SECONDS_PER_STEP = {
 _OTHER = 0.012  # of an algorithm that is not in the table
 _START = 2.0  # a process, its imports and the evaluations
 _LONGEST_NAME = 64
-_KINDS = {"class": attrgetter("class_name"), "algorithm": attrgetter("algorithm")}
+_KINDS: dict[str, Callable[[PlannedCell], str]] = {
+    "class": attrgetter("class_name"),
+    "algorithm": attrgetter("algorithm"),
+    "run": lambda cell: str(cell.run),
+}
 
 
 class Estimator:
@@ -143,7 +147,8 @@ def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[Pl
         kind, equals, glob = text.partition("=")
         if not equals or kind not in _KINDS:
             raise OptionError(
-                f"only={text!r}: must be class=GLOB or algorithm=GLOB, such as class='k-*'."
+                f"only={text!r}: must be class=GLOB, algorithm=GLOB or run=GLOB, such as "
+                "class='k-*'."
             )
         names = sorted({_KINDS[kind](cell) for cell in cells})
         matches = [name for name in names if fnmatchcase(name, glob)]

@@ -329,7 +329,7 @@ class StudyStatus:
 def study_status(folder: str | os.PathLike[str], only: Sequence[str] = ()) -> StudyStatus:
     """The state of the study in a folder. Changes nothing, and may be called while it runs.
 
-    `only` has patterns `class=GLOB`, `algorithm=GLOB`; it is empty for every cell of the plan.
+    `only` has patterns `class=GLOB`, `algorithm=GLOB`, `run=GLOB`; empty for every cell.
     """
     ledger = Ledger(folder)
     return plan_status(ledger, ledger.study_file(), only)

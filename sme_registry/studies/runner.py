@@ -62,7 +62,8 @@ def run_study(
       jobs: cells or programs at once; None for one per core, of this machine or of the cluster.
       ray: "local", which is the default of executor="ray", or the address of a Ray cluster.
       keep_models: of the cells that run now. Finished cells without a model do not run again.
-      only: `class=GLOB`, `algorithm=GLOB`: a cell must match any of the patterns of each kind.
+      only: `class=GLOB`, `algorithm=GLOB`, `run=GLOB`, of numbers from 0: a cell must match any of
+        the patterns of each kind.
       device: where programs of JAX run, "cpu", "gpu" or "tpu"; None for JAX's default.
       lanes: most runs of a program; None for a number that suits the device.
       run: runs a cell; for processes and Ray importable by name.

@@ -84,11 +84,13 @@ class TestScaled:
         assert few < many
         assert scaled(ABLATIONS, steps=100_000, seeds=10) is ABLATIONS
 
-    def test_a_selection_has_any_pattern_of_a_kind_and_both_kinds(self):
+    def test_a_selection_has_any_pattern_of_a_kind_and_every_kind(self):
         found = selected(ABLATIONS.plan.cells, ["class=k-*", "class=default", "algorithm=[PT]*"])
         assert {cell.class_name for cell in found} == {"k-5", "k-10", "k-25", "k-100", "default"}
         assert {cell.algorithm for cell in found} == {"PPO", "TD3"}
         assert len(found) == 5 * 2 * 10
+        few = selected(ABLATIONS.plan.cells, ["class=k-*", "run=0", "run=[34]"])
+        assert {cell.run for cell in few} == {0, 3, 4}
         assert selected(ABLATIONS.plan.cells) == ABLATIONS.plan.cells
 
 
