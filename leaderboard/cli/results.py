@@ -302,7 +302,7 @@ def _print_scores(result: Result) -> None:
     assert result.scores is not None
     scores = Table(
         "normalised regret (0 optimal, 1 the constant ½)",
-        {"": "text", "θ": "number", "low": "number", "high": "number"},
+        {"": "text", "score": "number", "low": "number", "high": "number"},
     )
     rows = {text.label: getattr(result.scores, name) for name, text in METRICS.items()}
     for m, value in enumerate(result.scores.normalised_regret):
