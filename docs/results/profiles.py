@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--folder", default="runs/profiles", help="of the study")
     parser.add_argument("--minutes", type=int, default=0, help="stop after so many")
     parser.add_argument("--jobs", type=int, help="programs at once; default one per core")
-    parser.add_argument("--lanes", type=int, help="most runs of a program")
+    parser.add_argument("--lanes", type=int, help="most runs of a program; fewer are filled up")
     parser.add_argument("--out", type=Path, default=REFERENCES)
     options = parser.parse_args()
     if options.minutes:
