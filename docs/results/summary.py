@@ -87,8 +87,8 @@ def discounts() -> pd.DataFrame:
     return paired(runs, "normalised_regret_0", "PPO (gamma 0)", "PPO")
 
 
-def profiles() -> pd.DataFrame:
-    """N₀ of five runs of 20,000 steps, where each has so many, and of clones; TD3 minus PPO."""
+def profiles() -> Iterator[pd.DataFrame]:
+    """N₀ of five runs of 20,000 steps, where each has so many, and of clones; minus PPO's."""
     agents = [*Profile.references().values()]
     agents += [Profile.read(path) for path in RESULTS.glob("unfinished-profiles/*.json")]
     runs = [
@@ -99,7 +99,9 @@ def profiles() -> pd.DataFrame:
     ]
     clones = pd.read_csv(RESULTS / "ablations-in-jax" / "clones.csv")
     clones["algorithm"] = "clone, " + clones["algorithm"]
-    return paired(pd.concat([pd.DataFrame(runs), clones]), "wd_regret", "TD3", "PPO")
+    table = pd.concat([pd.DataFrame(runs), clones])
+    yield paired(table, "wd_regret", "TD3", "PPO")
+    yield paired(table, "wd_regret", "SAC", "PPO")[["difference", "low", "high", "pairs", "lower"]]
 
 
 def paired(runs: pd.DataFrame, value: str, one: str, other: str) -> pd.DataFrame:
@@ -200,7 +202,7 @@ def ablations() -> Iterator[Any]:
     """Levels by class, and of policies that learn nothing."""
     yield classes(rows("ablations-in-jax", "runs.csv"))
     yield discounts()
-    yield profiles()
+    yield from profiles()
     runs = rows("ablations-in-jax", "runs-20000.csv")
     yield each_run(runs)
     yield classes(runs)["wd_regret"]

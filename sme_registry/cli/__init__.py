@@ -20,7 +20,7 @@ class _Commands(CommandGroup):
         "train": (f"{__name__}.train", "Train an agent with its exact regret, and evaluate it."),
         "evaluate": (f"{__name__}.evaluate", "Evaluate a policy in and out of distribution."),
         "diagnose": (f"{__name__}.evaluate", "Show where a policy's regret occurs, and why."),
-        "profile": (f"{__name__}.profile", "Show where an algorithm breaks, beside PPO."),
+        "profile": (f"{__name__}.profile", "Show where an algorithm breaks, beside known ones."),
         "study": (f"{__name__}.study", "Compare algorithms on classes of tasks, over seeds."),
         "data": (f"{__name__}.data", "Make data sets for offline RL, of a chosen quality."),
         "demo": (f"{__name__}.train", "Train, evaluate and draw, in less than a minute."),

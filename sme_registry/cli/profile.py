@@ -87,7 +87,7 @@ def profile(
         bool, typer.Option("--retry", help="Also run the cells that failed before.")
     ] = False,
 ) -> None:
-    """Show where an algorithm breaks: along which axis of the task, how far, and beside PPO.
+    """Show where an algorithm breaks: along which axis, how far, and beside PPO, TD3 and SAC.
 
     It trains on the default and on two harder levels of each of nine axes, five draws of each, and
     writes one page, profile.html. Your own algorithm is a function in a file:
