@@ -70,15 +70,16 @@ def part(page, begin, end):
 )
 def test_the_numbers_of_a_table_are_those_of_the_committed_rows(page, begin, end, script):
     pytest.importorskip("pandas")
-    tables = "\n".join(re.findall(r"^\|.*", part(page, begin, end), re.M))
+    text = part(page, begin, end)
+    tables = "\n".join(re.findall(r"^\|.*", text, re.M))
     told = re.findall(r"-?\d+\.\d\d+", re.sub(r"= [\d., ]+", "", tables))
     output = printed(script, page)
     found = re.findall(r"-?\d+\.\d+", output)
     assert len(told) > 5
     assert {float(number) for number in told} <= {float(number) for number in found}
-    # A value and its interval, or its range, are neighbours in the output, too.
+    # A value and its interval, or its range, are neighbours in the output, too, also of a sentence.
     n = r"(-?\d+\.\d+)"
-    intervals = re.findall(rf"{n} [(\[]{n}(?:,| to) {n}[)\]]", tables)
+    intervals = re.findall(rf"{n} [(\[]{n}(?:,| to) {n}[)\]]", text)
     neighbours = re.findall(rf"(?={n} +{n} +{n})", output)
     assert as_numbers(intervals) <= as_numbers(neighbours)
 
