@@ -85,7 +85,9 @@ def pytest_collection(session):
     """Every second worker begins with the last files, so that two compile half of them each."""
     worker = getattr(session.config, "workerinput", {}).get("workerid", "gw0")
     if int(worker.removeprefix("gw")) % 2:
-        for path in sorted(Path(__file__).parent.rglob("test_*.py"), reverse=True):
+        asked = [Path(text.partition("::")[0]).resolve() for text in session.config.args]
+        files = {file for path in asked for file in (path, *path.rglob("test_*.py"))}
+        for path in sorted((file for file in files if file.match("test_*.py")), reverse=True):
             with contextlib.suppress(pytest.skip.Exception):  # where an extra is missing
                 importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
 

@@ -42,6 +42,7 @@ DOCUMENTS = {
 
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_shaping_adds_up_to_the_first_potential_and_all_environments_agree(name, backend):
+    pytest.importorskip("stable_baselines3")
     sb3 = pytest.importorskip("sme_registry.sb3")
     document, B = DOCUMENTS[name], 5
     env = SMEEnv(document)
