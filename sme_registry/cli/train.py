@@ -234,6 +234,7 @@ def _train_task(options: Settings, task: str) -> None:
         overrides |= {name: settings[name] for name in settings if name in StreamSpec.model_fields}
     document = load_changed(task, overrides)
     uses = options.uses(document)
+    algorithms.find(uses).check_learns()
     algorithms.check_hyperparameters(uses, settings, others=SMESpec.model_fields)
     folder = options.folder(
         _label(task, document, changed=bool(overrides)), uses, f"-seed{options.seed}"

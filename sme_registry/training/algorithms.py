@@ -153,12 +153,15 @@ class Entry:
         model: type[StrictModel] = imported(self.backend.settings)(self.name)
         return model
 
-    def learner(self, run: Run) -> Learner:
-        """What learns in this run."""
+    def check_learns(self) -> None:
+        """Raise if it learns from data, or not at all."""
         if not self.backend.learner:
             raise OptionError(
                 f"algorithm={self.uses!r}: learns in no environment. Use it in a study."
             )
+
+    def learner(self, run: Run) -> Learner:
+        """What learns in this run."""
         learner: Learner = imported(self.backend.learner)(self.name, run)
         return learner
 

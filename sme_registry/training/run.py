@@ -202,6 +202,7 @@ def train(
     protocol = resolve_protocol(protocol or default_protocol(steps))
     uses = full_name(default_algorithm(document) if algorithm is None else algorithm, agents)
     entry = find(f"independent:{uses}" if independent else uses)
+    entry.check_learns()
     independent = entry.kind == "independent"
     hyperparameters = nested_hyperparameters(hyperparameters or {})
     with quiet():

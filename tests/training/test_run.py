@@ -235,6 +235,7 @@ def test_a_folder_with_other_files_is_never_touched(tmp_path):
         ({"task": {"state_dim": 2**20, "action_dim": 2**20}}, "state_dim"),
         ({"algorithm": "independent:PPO"}, "learns the task of a team, and this is a task of a"),
         ({"algorithm": "reference:linear"}, "Use it in a study"),
+        ({"algorithm": "offline:bc"}, "Use it in a study"),
         ({"resume": True}, "contains no run to resume. Leave out --resume"),
         ({"hyperparameters": {"buffer_size": 10**15}}, "rejects the task or .*buffer_size"),
         ({"hyperparameters": {"gama": 0.9}}, "Did you mean 'gamma'"),
