@@ -9,8 +9,8 @@ runs/profiles, which is not in the repository), also after a kill; programs that
 state every three minutes. After `--minutes`, and after Ctrl-C, what has finished is written, so a
 part is kept by committing it: a whole profile is in `sme_registry/profiles/references/`, a part of
 one in `unfinished-profiles/` beside this script, and no run of either is run again. TD3 and SAC
-with γ = 0 run on the default, the reward interval and foresight alone. The pages follow with
-`python docs/generate.py` and `python docs/figures.py profiles`.
+with γ = 0 run on the levels of the reward interval, complexity and foresight alone. The pages
+follow with `python docs/generate.py` and `python docs/figures.py profiles`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sme_registry.studies import run_study
 
 PARTS = Path(__file__).parent / "unfinished-profiles"
 SHORT = ("TD3 (gamma 0)", "SAC (gamma 0)")
-SHORT_AXES = ("k-5", "shaping-scale-10")  # a level of each
+SHORT_AXES = ("k-5", "complexity-2", "shaping-scale-10")  # a level of each
 
 
 def classes_of(name: str) -> tuple[str, ...]:
