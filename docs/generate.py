@@ -128,9 +128,10 @@ _PROFILES = """\
 What PPO and others do on the default and on two harder levels of nine axes, with 20,000 steps and
 five draws of each level. `sme profile` shows your own algorithm beside them, and
 `sme profile show PPO` one of them. Agents are in JAX, with the default hyperparameters of
-Stable-Baselines3; γ = 0 is their strongest setting where nothing but the present step matters, and
-their weakest on reward intervals and foresight. `linear` is the linear policy nearest to the
-optimum, and does not learn; a random policy has N₀ of about 1.3 at each level, 1.55 at A = 16.
+Stable-Baselines3; γ = 0 is mostly their strongest setting where nothing but the present step
+matters, and their weakest on reward intervals and foresight. `linear` is the linear policy nearest
+to the optimum, and does not learn; a random policy has N₀ of about 1.3 at each level, 1.55 at
+A = 16.
 PPO trains in whole rollouts, so for 20,480 steps.
 
 ![PPO and other references over the levels of nine axes](../../figures/profiles.png)
@@ -138,13 +139,14 @@ PPO trains in whole rollouts, so for 20,480 steps.
 ## N₀ at each level
 
 Normalised regret in the training cube: 0 is the optimum, 1 the constant action ½. IQM over draws.
-The first level of foresight and noise is a task of two layers.
+The first level of foresight and noise is a task of two layers, and layers are `unit_variance`.
 """
 _ROBUSTNESS = """
 ## Robustness
 
 The mean over the harder levels of 1 − N₀ there, divided by 1 − N₀ at the first level, with its
-95 % interval over draws. A dash: nothing was learnt, or a level was not run.
+95 % interval over draws; below 0 it is worse than the constant ½. A dash: nothing was learnt, or a
+level was not run.
 """
 _ORIGIN = """
 ## Origin

@@ -56,7 +56,7 @@ _TOGETHER = ("wd_regret", "ood_regret")
 _LIMITS = "limits-and-distractors"
 # A setting has the rows of the first page that knows it.
 STUDIES = (
-    Study("ablations-in-jax/runs-20000.csv", "ablations.md", "paper-ablations", _BY_REGION),
+    Study("ablations-in-jax/runs-20000.csv", "decay.md", "paper-ablations", _BY_REGION),
     Study("ablations-in-jax/runs.csv", "ablations.md", "paper-ablations", _BY_REGION),
     Study("baselines.csv", "agents.md#on-smoke-v1-by-the-rule-of-a-board", "smoke", _TOGETHER),
     *(

@@ -55,19 +55,19 @@ def in_cube(lives: pd.DataFrame) -> pd.DataFrame:
 
 
 def rows(*path: str) -> pd.DataFrame:
-    """The rows of a page, with `loss_1` and `loss_5`: (r̃_WD − r̃_m)/r̃_WD in per cent."""
+    """The rows of a page, with `decay_1` and `decay_5`: (r̃_WD − r̃_m)/r̃_WD in per cent."""
     runs = pd.read_csv(RESULTS.joinpath(*path))
     for m in (1, 5):
         lost = runs["similarity_0"] - runs[f"similarity_{m}"]
-        runs[f"loss_{m}"] = 100.0 * lost / runs["similarity_0"]
+        runs[f"decay_{m}"] = 100.0 * lost / runs["similarity_0"]
     return runs
 
 
 def classes(runs: pd.DataFrame) -> pd.DataFrame:
-    """N₀, N̄, the loss in the outermost shell and online regret of each class, means over runs."""
+    """N₀, N̄, the decay in the outermost shell and online regret of each class, means over runs."""
     shells = [f"normalised_regret_{m}" for m in range(1, 6)]
     runs = runs.assign(ood_regret=runs[shells].mean(axis=1), wd_regret=runs["normalised_regret_0"])
-    values = ["wd_regret", "ood_regret", "loss_5", "online_regret", "linear_normalised_regret"]
+    values = ["wd_regret", "ood_regret", "decay_5", "online_regret", "linear_normalised_regret"]
     order = list(dict.fromkeys(runs["class_name"]))
     table = runs.pivot_table(index="class_name", columns="algorithm", values=values, aggfunc="mean")
     return table.loc[order, values].round(3)
@@ -118,20 +118,20 @@ def paired(runs: pd.DataFrame, value: str, one: str, other: str) -> pd.DataFrame
     return table.assign(**columns, lower=lower).round(2)
 
 
-def losses(runs: pd.DataFrame) -> pd.DataFrame:
+def decays(runs: pd.DataFrame) -> pd.DataFrame:
     """What is lost outside, and how it goes with r̃_WD: ρ over runs, and over ranks in classes."""
     depth = runs["complexity"].map(lambda L: "L = 1" if L == 1 else "L > 1")
     parts = pd.concat([runs.assign(tasks="all"), runs.assign(tasks=depth)])
     table = {}
     for key, group in parts.groupby(["algorithm", "tasks"], sort=False):
-        pair = group[["similarity_0", "loss_5"]]
+        pair = group[["similarity_0", "decay_5"]]
         ranks = pair.groupby(group["class_name"]).rank()
         table[key] = {
             "runs": len(group),
-            "loss_1": group["loss_1"].mean(),
-            "sd_1": group["loss_1"].std(),
-            "loss_5": group["loss_5"].mean(),
-            "sd_5": group["loss_5"].std(),
+            "decay_1": group["decay_1"].mean(),
+            "sd_1": group["decay_1"].std(),
+            "decay_5": group["decay_5"].mean(),
+            "sd_5": group["decay_5"].std(),
             "ρ within classes": ranks.corr().iloc[0, 1],
             "ρ pooled": stats.spearmanr(*pair.to_numpy().T).statistic,
             **cosines(*pair.to_numpy().T),
@@ -140,7 +140,7 @@ def losses(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def cosines(x: np.ndarray, y: np.ndarray, draws: int = 2_000) -> dict[str, float]:
-    """The cosine of r̃_WD and loss, and its distribution with losses permuted between runs."""
+    """The cosine of r̃_WD and decay, and its distribution with decays permuted between runs."""
     rng = np.random.default_rng(0)
 
     def cosine(other: np.ndarray) -> float:
@@ -164,8 +164,8 @@ def references(*names: str) -> pd.DataFrame:
             table[name, policy] = {
                 "N0": np.mean([report.wd_regret for report in reports]),
                 "mean N": np.mean([report.ood_regret for report in reports]),
-                "mean loss": lost.mean(),
-                "loss_5": lost[:, -1].mean(),
+                "mean decay": lost.mean(),
+                "decay_5": lost[:, -1].mean(),
             }
     return pd.DataFrame(table).T.round(2)
 
@@ -211,9 +211,9 @@ def ablations() -> Iterator[Any]:
 
 
 def decay() -> Iterator[Any]:
-    """Losses outside the cube, and what goes with them."""
+    """Decays outside the cube, and what goes with them."""
     for name in ("runs.csv", "runs-20000.csv"):
-        yield losses(rows("ablations-in-jax", name))
+        yield decays(rows("ablations-in-jax", name))
     yield references("Default", "Complexity10")
 
 

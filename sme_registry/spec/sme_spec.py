@@ -55,7 +55,7 @@ class Setting(Document):
     Attributes:
       state_dim: S, state channels.
       action_dim: A, action channels.
-      k: steps between payouts of the reward.
+      k: steps between payouts, each of the sum of the step rewards since the last.
       r_min: reward threshold: step rewards at or below it are set to 0.
       D: survival threshold: a step reward below it ends the episode.
       complexity: L, layers of the optimal policy.
