@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import re
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -119,16 +120,17 @@ def run(
         lanes=lanes,
     )
     print_status(status, json)
-    check_complete(status)
+    check_complete(status, only or ())
 
 
-def check_complete(status: StudyStatus) -> None:
+def check_complete(status: StudyStatus, only: Sequence[str] = ()) -> None:
     """End with exit code 1 if cells failed."""
     if status.failed:
-        again = f"sme study run {status.folder / PLAN} --folder {status.folder} --retry"
+        again = ["sme", "study", "run", f"{status.folder / PLAN}", "--folder", f"{status.folder}"]
+        again += ["--retry", *(word for glob in only for word in ("--only", glob))]
         print_note(
             f"[bold red]{len(status.failed)} of {len(status.cells)} cells failed.[/] "
-            f"To run them again: {escape(again)}"
+            f"To run them again: {escape(shlex.join(again))}"
         )
         raise typer.Exit(1)
 

@@ -205,6 +205,22 @@ def available_cores() -> int:
 
 
 @contextlib.contextmanager
+def children_without_main() -> Iterator[None]:
+    """Processes that are spawned inside the block do not import the script that runs.
+
+    So it needs no `__main__` guard, without which it would run again in each of them.
+    """
+    main = vars(sys.modules["__main__"])
+    hidden: dict[str, Any] = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    main.pop("__file__", None)
+    main["__spec__"] = None
+    try:
+        yield
+    finally:
+        main.update(hidden)
+
+
+@contextlib.contextmanager
 def child_environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Environment variables of the processes that are started inside the block."""
     before = {name: os.environ.get(name) for name in variables}

@@ -34,7 +34,7 @@ from sme_registry.studies.report.findings import THRESHOLDS
 from sme_registry.studies.report.tables import paired
 from sme_registry.studies.result import CellResult
 
-COMPARED = "PPO", "TD3", "SAC"  # in sentences; other references are in figures and tables
+COMPARED = "PPO", "TD3", "SAC"  # in sentences, by default; others are in figures and tables
 DEFAULT, TWO_LAYERS = "default", "complexity-2"
 REFERENCES = Path(__file__).parent / "references"
 UNLEARNT = THRESHOLDS["unlearnt"]
@@ -183,15 +183,22 @@ class Profile(StoredModel):
         return self.algorithm.name
 
     def comparable(self, others: Iterable[Profile]) -> list[Profile]:
-        """Those with the same levels, draws and steps, without another of the same algorithm."""
+        """Those with the same levels, draws and steps, without another of the same algorithm.
+
+        One of the same name, such as ours of a PPO of Stable-Baselines3, is "reference PPO".
+        """
         mine = self.algorithm.uses, self.algorithm.hyperparameters
         return [
-            other
+            other._named(f"reference {other.name}") if other.name == self.name else other
             for other in others
             if other.plan_digest == self.plan_digest
             and (other.steps == self.steps or not other.learns)
             and (other.algorithm.uses, other.algorithm.hyperparameters) != mine
         ]
+
+    def _named(self, name: str) -> Self:
+        algorithm = self.algorithm.model_copy(update={"name": name})
+        return self.model_copy(update={"algorithm": algorithm})
 
     @property
     def learns(self) -> bool:
@@ -265,10 +272,13 @@ class Profile(StoredModel):
     def sentences(self, others: Iterable[Profile] | None = None) -> list[str]:
         """Where it breaks, how fast it learns, and where it is better or worse than PPO, TD3, SAC.
 
-        `others` are the profiles it is compared with, by default `references()`.
+        `others` are the profiles it is compared with, by default these three references.
         """
-        compared = [other for other in self.behind(others) if other.name in COMPARED]
-        return [*self._breaks(), self._speed(), *map(self._comparison, compared)]
+        if others is None:
+            known = self.references()
+            others = (known[name] for name in COMPARED if name in known)
+        said = map(self._comparison, self.comparable(others))
+        return [*self._breaks(), self._speed(), *filter(None, said)]
 
     def _breaks(self) -> list[str]:
         kept = {axis.label: self.robustness(axis) for axis in AXES}
@@ -308,6 +318,8 @@ class Profile(StoredModel):
 
     def _comparison(self, other: Profile) -> str:
         contrasts, groups = self.contrasts(other), dict[str, list[str]]()
+        if not contrasts:
+            return ""
         for label in sorted(contrasts, key=lambda label: -abs(contrasts[label].value)):
             each = contrasts[label]
             few = "as an indication only, " if each.verdict == "indication" else ""

@@ -41,13 +41,14 @@ def write_page(
 
     `references` are drawn behind, as far as they are comparable; by default the package's.
     """
-    others, folder = profile.behind(references), Path(folder)
+    given = None if references is None else [*references]
+    others, folder = profile.behind(given), Path(folder)
     drawn = {"axes": draw_axes(profile, others), "robustness": draw_robustness(profile, others)}
     page = rendered(
         "profile.html.jinja",
         Path(__file__).parent / "templates",
         profile=profile,
-        sentences=profile.sentences(others),
+        sentences=profile.sentences(given),
         figures={name: encoded(figure, ["svg"])["svg"] for name, figure in drawn.items()},
         tables=[_robustness(profile, others), *_differences(profile, others), _levels(profile)],
         origin=_origin(profile, others),

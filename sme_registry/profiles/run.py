@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.io import check_writable, choice, require_packages
+from sme_registry.io import check_writable, choice, integer_in, require_packages
 from sme_registry.io.system import module_file
 from sme_registry.profiles.document import AXES, DEFAULT, Profile, ProfileFailure, plan_file, row_of
 from sme_registry.profiles.page import write_page
@@ -65,10 +65,11 @@ def profile(
       sme_registry.errors.OptionError: ...: cannot be called with an environment, steps, a seed ...
     """
     require_packages("profiles", {"matplotlib": "Matplotlib", "pandas": "pandas"}, "studies")
+    steps = None if steps is None else integer_in("steps", steps, 1)
     algorithm = _algorithm(train, name, agents, hyperparameters or {})
     folder = default_folder(algorithm.name) if folder is None else Path(folder)
     file = study_of(algorithm, steps=steps, seeds=QUICK_SEEDS if quick and not seeds else seeds)
-    _check_folder(folder, algorithm)
+    _check_folder(folder, file, algorithm)
     check_writable(folder / "profile.json")
     in_memory = functions.is_in_memory(algorithm.uses)
     if in_memory and jobs not in (None, 1):
@@ -110,6 +111,9 @@ def study_of(
 ) -> StudyFile:
     """The study of a profile: the plan of all profiles with this algorithm."""
     fields = plan_file().plan.to_dict() | {"algorithms": [algorithm.to_dict()]}
+    for member in fields["classes"]:  # each run has a draw of its own
+        drawn = range(1, 1 + max(len(member["seeds"]), seeds or 0))
+        member["seeds"] = list(drawn)
     plan = StudyPlan.from_dict(fields, "profile")
     name = f"profile-{slug(algorithm.name)}"[:64]
     file = StudyFile(name=name, digest=plan.digest, plan=plan)
@@ -156,13 +160,14 @@ def _uses_of(train: Callable[..., Any]) -> str:
     return functions.keep_in_memory(train)
 
 
-def _check_folder(folder: Path, algorithm: StudyAlgorithm) -> None:
+def _check_folder(folder: Path, plan: StudyFile, algorithm: StudyAlgorithm) -> None:
     """Refuse the folder of another study: its plan would be replaced."""
     earlier = Ledger(folder).plan_file()
     if earlier is None:
         return
-    same = {(each.uses, str(each.hyperparameters)) for each in earlier.plan.algorithms}
-    if same != {(algorithm.uses, str(algorithm.hyperparameters))}:
+    found = [(each.uses, each.hyperparameters) for each in earlier.plan.algorithms]
+    levels, known = ({m.name: m.setting for m in file.plan.classes} for file in (plan, earlier))
+    if found != [(algorithm.uses, algorithm.hyperparameters)] or levels != known:
         listed = ", ".join(each.name for each in earlier.plan.algorithms)
         raise OptionError(
             f"folder={str(folder)!r}: holds the study {earlier.versioned_name} of {listed}, not a "

@@ -33,6 +33,7 @@ from sme_registry.io.system import (
     available_cores,
     block_interrupts,
     child_environment,
+    children_without_main,
     defer_interrupts,
     end_with_parent,
 )
@@ -243,7 +244,9 @@ class _JobProcess:
         on_cpu = job.program is not None and job.program.device == CPU
         # Or JAX would look for a GPU, and take most of its memory.
         variables = _ONE_THREAD | ({"JAX_PLATFORMS": CPU} if on_cpu else {})
-        with child_environment(variables), block_interrupts():
+        of_script = run.__module__ == "__main__"
+        unguarded = contextlib.nullcontext() if of_script else children_without_main()
+        with child_environment(variables), unguarded, block_interrupts():
             process.start()
         child_end.close()  # so that the pipe ends when the process does
         return cls(job, process, pipe, log, unfinished)

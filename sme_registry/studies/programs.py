@@ -32,6 +32,7 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
+from sme_registry.io.system import children_without_main
 from sme_registry.jax import find_device
 from sme_registry.jax.program import Evaluation, StepLog
 from sme_registry.jax.run import hidden_of, new_program, policy_of
@@ -132,7 +133,7 @@ def platform_of(device: str | None) -> str:
     if not importlib.metadata.entry_points(group="jax_plugins"):
         return _platform(device)
     # In a process of its own, or this one would take a GPU's memory.
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
+    with children_without_main(), multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(_platform, (device,))
 
 

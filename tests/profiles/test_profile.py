@@ -17,6 +17,7 @@ from sme_registry.profiles.document import AXES, DEFAULT, REFERENCES, TWO_LAYERS
 from sme_registry.profiles.page import write_page
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.studies import run_study
+from sme_registry.studies.ledger import Ledger
 from tests import commands
 
 PLAN = document.plan_file()
@@ -56,6 +57,13 @@ class TestPlan:
                 base, harder = settings[axis.base], settings[level]
                 changed = {name for name in base if base[name] != harder[name]}
                 assert changed - {"policy_init"} == {stem.partition("-")[0]}
+
+    def test_more_draws_are_other_draws(self):
+        algorithm = next(a for a in PLAN.plan.algorithms if a.name == "linear")
+        five, seven = (run.study_of(algorithm, seeds=seeds).plan.cells for seeds in (None, 7))
+        assert {each.cell.digest for each in five} < {each.cell.digest for each in seven}
+        of_default = [each.cell.spec.digest for each in seven if each.class_name == DEFAULT]
+        assert len({*of_default}) == 7
 
 
 class TestReferences:
@@ -217,6 +225,26 @@ class TestFacts:
         assert made(lambda level, i: 0.1, steps=500).comparable([ppo, linear]) == [linear]
         assert ppo.comparable([ppo, linear]) == [linear]
 
+    def test_one_of_the_same_name_is_told_apart(self, tmp_path):
+        ppo = Profile.references()["PPO"]
+        mine = made(lambda level, i: 0.1 if level in (DEFAULT, TWO_LAYERS) else 0.91, name="PPO")
+        (other,) = mine.comparable([ppo])
+        assert (other.name, other.rows) == ("reference PPO", ppo.rows)
+        axis = AXIS["k"]
+        table = page._robustness(mine, [other]).frame.set_index("axis").loc[axis.label]
+        assert table["PPO"] == str(mine.robustness(axis)) == "0.10 [0.10, 0.10]"
+        assert table["reference PPO"] == str(ppo.robustness(axis))
+        write_page(mine, tmp_path)
+        text = (tmp_path / "profile.html").read_text()
+        assert "Against reference PPO, by the difference of N₀: worse on" in text
+        assert "Against TD3" in text
+
+    def test_sentences_compare_with_those_that_are_given(self):
+        mine, theirs = made(lambda level, i: 0.1), made(lambda level, i: 0.3, name="other")
+        assert "Against other, " in mine.sentences([theirs])[-1]
+        apart = made(lambda level, i: 0.3 if i > 2 else None, name="other")
+        assert len(made(lambda level, i: 0.1, draws=2).sentences([apart])) == 2
+
     def test_a_file_reads_back_and_a_newer_one_is_refused(self, tmp_path):
         profile = made(lambda level, i: 0.1 + 0.01 * i)
         path = profile.write(tmp_path / "profile.json")
@@ -295,6 +323,13 @@ class TestRun:
         assert made_of(learner, quick=True).planned == 2 * 2
         with pytest.raises(OptionError, match="holds the study"):
             made_of(learner, hyperparameters={"action": 0.5}, folder=folder)
+        plan = StudyPlan.from_dict(small.plan.to_dict() | {
+            "classes": small.plan.to_dict()["classes"][:1],
+            "algorithms": [profile.algorithm.to_dict()],
+        })  # fmt: skip
+        Ledger(folder).write_plan(StudyFile(name="another", digest=plan.digest, plan=plan))
+        with pytest.raises(OptionError, match="holds the study another"):
+            made_of(learner)
 
     def test_what_a_function_may_not_do_is_a_failed_run_that_says_so(self, small):
         def long(env, steps, seed):
@@ -323,6 +358,8 @@ class TestRun:
             made_of(other)
         with pytest.raises(OptionError, match="must be a function"):
             made_of(3)
+        with pytest.raises(OptionError, match="steps=0: must be"):
+            made_of(learner, steps=0)
         with pytest.raises(OptionError, match="jobs=2: must be 1"):
             made_of(learner, jobs=2)
         assert not Path("runs").exists()

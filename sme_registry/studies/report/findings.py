@@ -157,7 +157,7 @@ def _task(analysis: Analysis, name: str) -> Found:
         *(row for row in reversed(by_change) if _direction(row) == "better"),
         *(row for row in by_change if _direction(row) == "open"),
     ]
-    largest = {row.axis or row.class_name: row for row in reversed(ordered)}
+    largest = {_cause(row): row for row in reversed(ordered)}
     for row in reversed(largest.values()):
         yield finding(
             "tasks", "axis", _of_few(_direction(row), row.pairs),
@@ -165,6 +165,11 @@ def _task(analysis: Analysis, name: str) -> Found:
             row,
         )  # fmt: skip
     yield from _worst(analysis, name, "ood_regret")
+
+
+def _cause(row: Any) -> str:
+    """Its axis; its class, where it differs in none or several."""
+    return str(row.class_name if row.axis in ("", SEVERAL) else row.axis)
 
 
 def _worst(analysis: Analysis, name: str, metric: str) -> Found:
@@ -203,7 +208,7 @@ def _worst(analysis: Analysis, name: str, metric: str) -> Found:
         f"by {_change(worst)}.",
         worst,
     )  # fmt: skip
-    rivals = [row for row in contrasts if row.axis != worst.axis and not row.high < worst.low]
+    rivals = [row for row in contrasts if _cause(row) != _cause(worst) and not row.high < worst.low]
     verdict, text = "certain", "No interval allows as large a change by another axis."
     if rivals:
         names = dict.fromkeys(_property(analysis, row) for row in rivals)

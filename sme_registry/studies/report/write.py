@@ -146,7 +146,7 @@ def _contents(
     numbers, table = _main_table(analysis, tables)
     if "csv" in formats:
         contents["table.csv"] = numbers.to_csv(index=False, lineterminator="\n")
-    if "latex" in formats:
+    if "latex" in formats and table is not None:
         contents["table.tex"] = table.latex()
     if full:
         contents |= _every_file(analysis, formats, figures, tables)
@@ -162,14 +162,16 @@ def _main_figure(analysis: Analysis, figures: Sequence[Picture]) -> Picture:
     return preferred[0] if preferred else figures[0]
 
 
-def _main_table(analysis: Analysis, tables: Sequence[TextTable]) -> tuple[pd.DataFrame, TextTable]:
-    """The numbers of a paper's first table, and the table of the first metric."""
+def _main_table(
+    analysis: Analysis, tables: Sequence[TextTable]
+) -> tuple[pd.DataFrame, TextTable | None]:
+    """The numbers of a paper's first table, and the table of the first metric, if any is known."""
     name = "levels" if analysis.algorithms else "stream_metrics"
     differences = analysis.tables["differences"]
     if len(analysis.algorithms) == 2 and not differences.empty:
         return differences, comparison_tables(differences)[0]
     first = name.replace("_", "-")
-    return analysis.tables[name], next(t for t in tables if t.name.startswith(first))
+    return analysis.tables[name], next((t for t in tables if t.name.startswith(first)), None)
 
 
 def _every_file(

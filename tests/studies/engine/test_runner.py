@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -33,6 +34,14 @@ study, notes, seeds, open_for = sys.argv[1:]
 work = partial(cells.gated, Path(notes), open_for=int(open_for))
 run_study(cells.small_file(int(seeds)), study, jobs=2, run=work)
 """
+UNGUARDED = """
+import sys
+from sme_registry.studies.runner import run_study
+from tests.studies import cells
+print("begun")
+status = run_study(cells.small_file(), sys.argv[1], jobs=2)
+print(status.count("done"), "done")
+"""
 # A file may grow no longer than a plan: results are longer.
 FULL_DISK = """
 import resource, sys
@@ -42,23 +51,19 @@ main()
 """
 
 # File locks use fcntl through filelock, which has another implementation on Windows.
+MAIN = "from sme_registry.cli import main; main()"
 WITHOUT_POSIX = """
 import os, signal, sys
-from multiprocessing import resource_tracker
-import filelock
-if __name__ == "__main__":
-    resource_tracker.ensure_running()  # used on POSIX alone, and by multiprocessing itself
-for module in ("fcntl", "grp", "pwd", "resource", "termios"):
-    sys.modules[module] = None
-del signal.pthread_sigmask, os.sched_getaffinity
-"""
-RUN = """
-from sme_registry.cli import main
-from sme_registry import datasets, diagnosis, training
-for name in ("SIGHUP", "SIGALRM", "SIGCHLD"):
-    delattr(signal, name)
-if __name__ == "__main__":
-    main()
+if "resource_tracker" not in " ".join(sys.orig_argv):
+    from multiprocessing import resource_tracker
+    import filelock
+    if "--multiprocessing-fork" not in sys.orig_argv:
+        resource_tracker.ensure_running()  # used on POSIX alone, and by multiprocessing itself
+    for module in ("fcntl", "grp", "pwd", "resource", "termios"):
+        sys.modules[module] = None
+    del signal.pthread_sigmask, os.sched_getaffinity
+    for name in ("SIGHUP", "SIGALRM", "SIGCHLD"):
+        delattr(signal, name)
 """
 
 
@@ -402,7 +407,10 @@ def test_the_command_ends_with_1_where_a_cell_failed_and_lists_it(study, tmp_pat
     command = ("study", "run", plan, "-f", study, "--executor", "in-process")
     result = sme(*command)
     assert result.exit_code == 1, result.output
-    assert "2 of 4 cells failed. To run them again: sme study run" in result.stderr
+    again = ("sme", *command[:2], f"{study}/plan.json", "--folder", f"{study}", "--retry")
+    assert f"2 of 4 cells failed. To run them again: {shlex.join(again)}\n" in result.stderr
+    one = sme(*command, "--only", "run=0")
+    assert f"{shlex.join((*again, '--only', 'run=0'))}\n" in one.stderr
     assert "bad on small, run 0: OptionError: " in result.stdout
     again = sme(*command, "--retry", "--json")
     assert again.exit_code == 1
@@ -414,15 +422,24 @@ def test_the_command_ends_with_1_where_a_cell_failed_and_lists_it(study, tmp_pat
 def test_a_study_runs_without_posix_modules_and_signals(tmp_path):
     plan, study = tmp_path / "plan.json", tmp_path / "study"
     small_file(seeds=2).write(plan)
-    script = tmp_path / "sme_without_posix.py"
-    script.write_text(WITHOUT_POSIX + RUN)
-    command = [sys.executable, str(script), "study", "run", str(plan), "-f", str(study)]
+    (tmp_path / "sitecustomize.py").write_text(WITHOUT_POSIX)  # of this process and its children
+    command = [sys.executable, "-c", MAIN, "study", "run", str(plan), "-f", str(study)]
     process = subprocess.run(
         [*command, "--executor", "processes", "--jobs", "2"],
         capture_output=True,
         text=True,
         check=False,
-        env={"PYTHONPATH": str(ROOT), "PATH": "", "HOME": str(tmp_path)},
+        env={"PYTHONPATH": f"{tmp_path}:{ROOT}", "PATH": "", "HOME": str(tmp_path)},
     )
     assert process.returncode == 0, process.stderr
     assert study_status(study).count("done") == 2
+
+
+def test_a_script_needs_no_guard_for_its_processes(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED)
+    process = subprocess.run(
+        [sys.executable, script, tmp_path / "study"], capture_output=True, text=True, check=True,
+        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=120,
+    )  # fmt: skip
+    assert process.stdout.splitlines() == ["begun", "2 done"]

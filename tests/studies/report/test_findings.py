@@ -9,6 +9,7 @@ import pytest
 
 from sme_registry.studies.budget import scaled
 from sme_registry.studies.report.analysis import ENOUGH_RUNS, change_verdict
+from sme_registry.studies.report.design import SEVERAL
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.texts import comparison_caveats
 from tests.studies.finished import analysed, found, rows_of, with_tables
@@ -78,6 +79,14 @@ def test_larger_changes_that_are_open_are_rivals_of_the_worst(analysis):
         alpha = of_alpha(contrasted(analysis, "complexity-10", {"change": change, **SINGLE}))
         assert alpha["certainty of WD regret"].verdict == "rivals"
         assert "complexity L" in alpha["certainty of WD regret"].sentence
+
+
+def test_classes_that_differ_in_several_fields_are_rivals_of_each_other(analysis):
+    fields = {"change": 1.2, "low": 1.1, "high": 1.3, "axis": SEVERAL}
+    several = contrasted(contrasted(analysis, "k-25", fields), "complexity-10", fields)
+    assert of_alpha(several)["certainty of WD regret"].verdict == "rivals"
+    axes = rows_of(findings(several), algorithm="Alpha", question="axis")
+    assert {"k-25", "complexity-10"} <= {*axes.class_name}
 
 
 def test_few_pairs_make_an_indication_and_a_caveat(analysis):

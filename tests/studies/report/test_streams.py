@@ -50,6 +50,16 @@ def gaps(lived, tmp_path_factory):
     return folder
 
 
+def test_fresh_agents_alone_make_a_report(lived, tmp_path):
+    ledger = Ledger(tmp_path / "study")
+    file = Ledger(lived).study_file()
+    ledger.write_plan(file)
+    fresh = next(planned for planned in file.plan.cells if planned.phase is not None)
+    ledger.write(Ledger(lived).results([fresh.cell.digest])[fresh.cell.digest])
+    names = {path.name for path in write_report(ledger.folder)}
+    assert {"index.html", "table.csv"} <= names
+
+
 analysed = functools.cache(finished.analysed)
 
 
