@@ -214,9 +214,7 @@ def make_dataset(
         raise OptionError("nu, mix: give only one of them. `mix` accepts ν as a policy.")
     if action_range is not None:
         choice("action_range", action_range, ACTION_RANGES)
-    if isinstance(mix, str | float):
-        raise OptionError(f"mix={mix!r}: must be pairs of a policy and its share: [(0.5, 1)].")
-    pairs = [(0.5 if nu is None else nu, 1.0)] if mix is None else list(mix)
+    pairs = [(0.5 if nu is None else nu, 1.0)] if mix is None else _pairs(mix)
     behaviours = [parse_behaviour(policy, weight, action_range) for policy, weight in pairs]
     if action_range is not None and all(b.kind != "policy" for b in behaviours):
         raise OptionError(f"action_range={action_range!r}: is of policies in `mix`. Leave it out.")
@@ -276,8 +274,17 @@ def _hundredths(value: float) -> str:
     return f"{100 * value:.10g}".replace(".", "_").replace("-", "m").replace("+", "")
 
 
+def _pairs(mix: Any) -> list[tuple[Any, float]]:
+    try:
+        return [(policy, share) for policy, share in mix]
+    except (TypeError, ValueError):
+        text = f"mix={mix!r:.60}: must be pairs of a policy and its share: [(0.5, 1)]."
+        raise OptionError(text) from None
+
+
 def check_id(dataset_id: str) -> str:
     """Raise OptionError if Minari does not accept an id; it must be ASCII and have a version."""
+    dataset_id = str(dataset_id)
     *namespace, _ = dataset_id.split("/")
     # Minari's own pattern requires two characters; `data` is the folder inside a data set.
     short = len("/".join(namespace)) == 1

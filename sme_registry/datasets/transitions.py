@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.datasets.documents import DatasetRecipe
-from sme_registry.errors import FingerprintMismatchError
+from sme_registry.errors import FingerprintMismatchError, SpecError
 from sme_registry.evaluation.regions import expansion
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task, step
@@ -295,6 +295,8 @@ def positions(
       >>> positions(data.transitions(), data.recipe.spec, [0, 10])["t"].tolist()
       [0, 10]
     """
+    if spec.team is not None:
+        raise SpecError("team: values are of a single agent. Give the data set of such a task.")
     chosen = slice(None) if rows is None else np.asarray(rows)
     observed = transitions.observations[chosen].astype(np.float64)
     t = np.rint(observed[:, -2] * spec.horizon).astype(np.int64)

@@ -176,13 +176,12 @@ def rollout(
     """Whole episodes of a policy in the unit range, from initial states `[n, S]`, by agent.
 
     `act` maps float32 states `[n, S]` and joint observations `[n, O]` to the actions `[n, A]` of
-    all agents. `seed` is of the distractors.
+    all agents. `seed` is of distractors and noise.
     """
     n, agents = len(initial_states), len(task.owned)
     batch = Batch(task, n)
-    if task.spec.distractors:
-        for lane, word in enumerate(draw.bit_generator(seed, "diagnosis/lanes").random_raw(n)):
-            batch.seed(lane, int(word))
+    for lane, word in enumerate(draw.bit_generator(seed, "diagnosis/lanes").random_raw(n)):
+        batch.seed(lane, int(word))
     batch.begin(np.arange(n), batch.observe(), initial_states)
 
     def actions(s: Array, observation: Observation) -> Array:
@@ -401,12 +400,17 @@ def _module(network: Perceptron) -> Any:
 
 @contextlib.contextmanager
 def _torch_seed(seed: int) -> Iterator[None]:
-    """Seed PyTorch and use one thread; both are restored afterwards."""
+    """Seed PyTorch, and NumPy for noise of SB3, and use one thread; all are restored afterwards."""
     import torch
 
+    state = np.random.get_state()  # noqa: NPY002 (what SB3's action noise draws from)
     with one_thread(), quiet(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        yield
+        np.random.seed(seed % 2**32)  # noqa: NPY002
+        try:
+            yield
+        finally:
+            np.random.set_state(state)  # noqa: NPY002
 
 
 def network_state(network: Perceptron, observations: Observation) -> NetworkState | None:

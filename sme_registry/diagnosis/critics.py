@@ -10,6 +10,7 @@ Source: METHOD, section 11. A critic is compared with the policy that its target
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -153,7 +154,10 @@ class _Critic:
     def __init__(self, model: Any, seed: int) -> None:
         import torch
 
-        self._torch, self._network = torch, model.policy
+        # On the CPU: numbers do not depend on where a model is, and arrays are NumPy's.
+        on_cpu = model.policy.device.type == "cpu"
+        self._network = model.policy if on_cpu else copy.deepcopy(model.policy).cpu()
+        self._torch = torch
         self.observation_shape = model.observation_space.shape
         self._generator = torch.Generator().manual_seed(seed)
         self.name = type(model).__name__
@@ -201,7 +205,7 @@ class _Critic:
             return np.asarray(self._torch.cat(claims, dim=1).min(dim=1).values, np.float64)
 
     def _tensor(self, array: Any) -> Any:
-        return self._torch.as_tensor(np.asarray(array, np.float32), device=self._network.device)
+        return self._torch.as_tensor(np.asarray(array, np.float32), device="cpu")
 
     def _normal(self, like: Any) -> Any:
         return self._torch.randn(like.shape, generator=self._generator)
@@ -246,6 +250,7 @@ def critic(model: Any, task: SpecLike | Task, *, states: int = 500, seed: int = 
     """
     task = single_agent(load_task(task))
     integer_in("states", states, 1)
+    integer_in("seed", seed, 0)
     learnt = _critic_of(model, task, seed)
     points = {VISITED: _visited(task, learnt, states, seed)} | {
         regions.region_name(region): _drawn(task, states, seed, region)

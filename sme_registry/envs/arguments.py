@@ -107,8 +107,9 @@ def to_unit(
     """Actions `[…]` as float64 of the unit range, not clipped; rows `ignored` `[B]` become zero."""
     try:
         array = np.asarray(action)
-    except ValueError:
-        raise ActionError(f"action={action!r:.80}: must be an array of shape {shape}.") from None
+    except (ValueError, TypeError, RuntimeError) as error:  # of PyTorch: a gradient, or a GPU
+        text = f"action={action!r:.80}: must be an array of shape {shape}: {error}"
+        raise ActionError(text) from None
     if array.dtype.kind not in "fiu":
         raise ActionError(f"action={action!r:.80}: must be numbers, got dtype {array.dtype}.")
     if array.shape != shape:
@@ -171,6 +172,8 @@ def checked_seed(seed: Any) -> int | None:
 
 
 def check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
+    if not isinstance(options, Mapping | None):
+        raise OptionError(f"options={options!r:.80}: must be a dictionary, by name.")
     for name in options or {}:
         if name not in known:
             raise OptionError(

@@ -265,11 +265,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             except IndexError:
                 env._refill(action)
                 optimal, observation = next_rows()
-            try:
-                plain = action.dtype is no_checks and action.ndim == 1
-            except AttributeError:
-                plain = False
-            if plain:
+            # Arrays of other libraries have these attributes, too, and Numba does not take them.
+            if type(action) is np.ndarray and action.dtype is no_checks and action.ndim == 1:
                 reward, end = plain_step(buffer, action, optimal, observation)
             else:
                 action = env._checked(action)

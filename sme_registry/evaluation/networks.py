@@ -10,7 +10,6 @@ An .npz file holds `W0`, `b0`, `W1`, … in order, and `about`, a JSON text. Rea
 from __future__ import annotations
 
 import io
-import itertools
 import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -124,8 +123,8 @@ class Perceptron:
 class OfflinePolicy(Perceptron):
     """A perceptron from observations `[B, O]` to actions `[B, A]` in [0, 1], as an .npz file.
 
-    `layers` are `(W [out, in], b [out])` float32, first to last. `about` says what it was trained
-    on and how, in plain JSON data; "algorithm" names it in reports.
+    `layers` are `(W [out, in], b [out])`, first to last, copied as float32. `about` says what it
+    was trained on and how, in plain JSON data; "algorithm" names it in reports.
 
     Examples:
       >>> from sme_registry.datasets import OfflinePolicy
@@ -141,11 +140,18 @@ class OfflinePolicy(Perceptron):
     def __init__(
         self, layers: Sequence[OfflineLayer], about: Mapping[str, Any] = MappingProxyType({})
     ) -> None:
-        for array in itertools.chain(*layers):
-            array.setflags(write=False)
+        if not 1 <= len(layers) <= _MAX_LAYERS:
+            raise PolicyError(f"layers: must be 1 to {_MAX_LAYERS}, not {len(layers)}.")
+        self.layers = []
         activations = [*["relu"] * (len(layers) - 1), self._output]
-        # Transposed views: copies would multiply in another order.
-        self.layers = [(W.T, b, f) for (W, b), f in zip(layers, activations, strict=True)]
+        for index, (layer, activation) in enumerate(zip(layers, activations, strict=True)):
+            W, b = (np.array(array, np.float32, order="C") for array in layer)
+            width = len(self.layers[-1][1]) if self.layers else None
+            _check_layer(f"layers[{index}], transposed", W.T, b, width)
+            W.setflags(write=False)
+            b.setflags(write=False)
+            # A transposed view: a copy would multiply in another order.
+            self.layers.append((W.T, b, activation))
         self.low = self.high = None
         if self._output == "tanh":
             b = self.layers[-1][1]
@@ -195,14 +201,9 @@ class OfflinePolicy(Perceptron):
             layers = [(stored[f"W{i}"], stored[f"b{i}"]) for i in range(count)]
         if not isinstance(about, dict) or about.pop("kind", None) != cls.kind:
             raise PolicyError("its `about` does not name its kind.")
-        if not 1 <= count <= _MAX_LAYERS:
-            raise PolicyError(f"it has {count} layers.")
-        width = None
         for index, (W, b) in enumerate(layers):
             if W.dtype != np.float32 or b.dtype != np.float32:
                 raise PolicyError(f"layer {index}: is {W.dtype} and {b.dtype}, not float32.")
-            _check_layer(f"layer {index}, transposed", W.T, b, width)
-            width = len(b)
         return cls(layers, about)
 
 

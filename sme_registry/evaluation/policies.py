@@ -201,6 +201,9 @@ def as_policy(
     if isinstance(policy, str):
         policy, default = _named(policy, spec)
         name = name or default
+    if isinstance(policy, os.PathLike) and os.path.isdir(policy):
+        name = name or Path(policy).stem
+        policy = _of_agents(Path(policy), spec)
     if algorithm is not None:
         if not isinstance(policy, os.PathLike) or Path(policy).suffix != ".zip":
             raise PolicyError(
@@ -250,10 +253,8 @@ def _named(text: str, spec: SMESpec) -> tuple[Any, str]:
             "the loaded torch.nn.Module to `sme_registry.evaluate`, or write it with "
             "`sme_registry.export_onnx` and give the .onnx file."
         )
-    if text.endswith(_SUFFIXES) or os.path.isfile(text):
+    if text.endswith(_SUFFIXES) or os.path.exists(text):
         return path, path.stem
-    if os.path.isdir(text):
-        return _of_agents(path, spec), path.stem
     if ":" not in text:
         raise UnknownNameError(
             f"policy={text!r}: must be the path of a .zip, .onnx or .npz file, module:function, or "
@@ -388,15 +389,17 @@ def stream_policy(
     where: str,
     action_range: str | None = None,
     algorithm: str | None = None,
+    *,
+    alone: bool = False,
 ) -> Policy:
-    """A policy in any form, ready for a stream's observations; see `as_policy`."""
+    """A policy in any form, ready for a stream's observations, or `alone` for those of a phase."""
     with prefixed_errors(where):
         ready = as_policy(
             policy,
             stream.phases[0].spec,
             action_range=action_range,
             algorithm=algorithm,
-            observed_phases=stream.observed_phases,
+            observed_phases=0 if alone else stream.observed_phases,
         )
     assert isinstance(ready, Policy)  # streams have no teams
     return ready

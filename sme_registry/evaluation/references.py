@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sme_registry.errors import SpecError
+from sme_registry.io import choice
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
@@ -156,7 +157,7 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
       >>> optimal(np.full((3, 10), 0.5, np.float32)).shape
       (3, 4)
     """
-    name = OLD_NAMES.get(name, name)
+    name = choice("name", OLD_NAMES.get(name, name), POLICIES)
     joint, task = _joint_policy(name, spec), materialize(spec)
 
     def of_agent(observed: Sequence[int], owned: slice) -> Act:
@@ -165,7 +166,7 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
             s = np.zeros((len(observations), spec.state_dim))
             x = task.unmixed(observations[:, :-2]) if task.mixing else observations
             s[:, observed] = x[:, : len(observed)]
-            return joint(s)[:, owned]
+            return np.clip(joint(s)[:, owned], 0.0, 1.0)
 
         act.__name__ = name
         act.action_range = "unit"  # type: ignore[attr-defined]

@@ -259,6 +259,7 @@ class Actor(NamedTuple):
     policy: Policy
     phases: Sequence[int]  # on whose tasks it is measured
     where: str  # what an error calls it, such as "policies[2]"
+    observed_phases: int = 0  # entries at the end of what it sees
 
 
 def final_specs(stream: StreamSpec) -> tuple[SMESpec, ...]:
@@ -298,7 +299,7 @@ def stream_regrets(
             for j, a in enumerate(optimal):
                 of_optima[j, :, region] += [_distance(a, other) for other in optimal]
             for index, actor in enumerate(actors):
-                for phase, a in _actions(actor, batch, stream):
+                for phase, a in _actions(actor, batch):
                     errors[index, phase, region] += _distance(a, optimal[phase])
             count += len(batch)
             if progress is not None:
@@ -306,13 +307,13 @@ def stream_regrets(
     return errors / half, of_optima / half
 
 
-def _actions(actor: Actor, batch: Observations, stream: StreamSpec) -> Iterator[tuple[int, Array]]:
+def _actions(actor: Actor, batch: Observations) -> Iterator[tuple[int, Array]]:
     """The actor's actions `[B, A]` on each of its phases, in [0, 1]."""
-    policy, phases, where = actor
+    policy, phases, where, observed_phases = actor
     with prefixed_errors(where):
-        if stream.observes_phase:
+        if observed_phases:
             for phase in phases:
-                informed = policy.in_phase(phase, stream.observed_phases)
+                informed = policy.in_phase(phase, observed_phases)
                 yield phase, np.clip(informed(batch), 0.0, 1.0)
         else:
             a = np.clip(policy(batch.copy()), 0.0, 1.0)  # a copy: a policy may write into it

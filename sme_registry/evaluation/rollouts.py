@@ -82,6 +82,7 @@ class Rollouts(NamedTuple):
     regret: Array  # mean of 1 − step reward over its steps, in [0, 1]
     similarity: Array  # mean r̃ over its steps, in [0, 1]
     similarity_square: Array  # mean r̃² over its steps, in [0, 1]
+    terminated: Array  # 1 where D ended it, possibly at its last step; or 0
     agents_regret: Array  # `[agents, n]` the same as `regret` for each agent
 
     def per_step(self, values: Array) -> float:
@@ -127,7 +128,7 @@ def rollouts(
     n, agents = len(states), len(task.policies)
     t = np.zeros(n, np.int64) if t is None else t
     r_cum = np.zeros(n) if r_cum is None else r_cum
-    totals = np.empty((6 + agents, n))
+    totals = np.empty((7 + agents, n))
     # Sorted by t, the episodes of a batch end at about the same time, and few environments idle.
     order = np.argsort(t, kind="stable")
     for start in range(0, n, MOST_ENVS):
@@ -138,18 +139,21 @@ def rollouts(
         batch.place(states[rows], t[rows], np.repeat(r_cum[rows, None], agents, axis=1), seen)
         first = None if actions is None else actions[rows]
         totals[:, rows] = _sums(batch, _Acting(policy, first, at_end), gamma)
-    returns, discounted, length = totals[:3]
-    regret, similarity, square, *of_agents = totals[3:] / length
-    return Rollouts(returns, discounted, length, regret, similarity, square, np.array(of_agents))
+    returns, discounted, terminated, length = totals[:4]
+    regret, similarity, square, *of_agents = totals[4:] / length
+    return Rollouts(
+        returns, discounted, length, regret, similarity, square, terminated, np.array(of_agents)
+    )
 
 
 def _sums(batch: Batch, act: _Acting, gamma: float) -> Array:
-    sums, weight = np.zeros((6 + len(batch.task.policies), batch.num_envs)), 1.0
+    sums, weight = np.zeros((7 + len(batch.task.policies), batch.num_envs)), 1.0
     for step in play(batch, act):
         values = step.result.values
         similarity, regret, reward = _team_means(values[[SIMILARITY, REGRET, REWARD]])
         paid = weight * (reward + act.bonus)
-        rows = (reward, paid, 1.0, regret, similarity, similarity**2, *values[REGRET])
+        ended = step.result.terminated
+        rows = (reward, paid, ended, 1.0, regret, similarity, similarity**2, *values[REGRET])
         for total, value in zip(sums, rows, strict=True):
             total += step.running * value
         weight *= gamma
@@ -263,14 +267,14 @@ def expected_returns(
 ) -> tuple[Array, Array]:
     """`values` of checked arguments to the end of the episode `[B]`, and the discount there.
 
-    The discount γ^(T − t) is 0 of episodes that D ends before. `begun` are r_cum, distractors and
+    The discount γ^(T − t) is 0 of episodes that D ends. `begun` are r_cum, distractors and
     first actions.
     """
     finite, left, steps = [], [], task.spec.horizon - t
     for i in range(samples):
         runs = rollouts(policy, task, s, t=t, gamma=gamma, seed=seed + i, **begun)
         finite.append(runs.discounted_return)
-        left.append(np.where(runs.length < steps, 0.0, gamma**steps))
+        left.append(np.where(runs.terminated, 0.0, gamma**steps))
     return np.mean(finite, axis=0), np.mean(left, axis=0)
 
 

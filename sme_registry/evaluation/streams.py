@@ -296,9 +296,11 @@ def evaluate_stream(
 
     actors: list[Actor] = []
 
-    def add(policy: Any, where: str, phases: Sequence[int] = range(P)) -> int:
-        ready = stream_policy(policy, stream, where, action_range, algorithm)
-        actors.append(Actor(ready, phases, where))
+    def add(policy: Any, where: str, phase: int | None = None) -> int:
+        alone = phase is not None
+        ready = stream_policy(policy, stream, where, action_range, algorithm, alone=alone)
+        phases = range(P) if phase is None else [phase]
+        actors.append(Actor(ready, phases, where, 0 if alone else stream.observed_phases))
         return len(actors) - 1
 
     rows: dict[int, int] = {}  # a policy of several visits acts once
@@ -307,7 +309,7 @@ def evaluate_stream(
             rows[id(policy)] = add(policy, f"policies[{v}]")
     life = [rows[id(policy)] for policy in policies]
     before = None if initial is None else add(initial, "initial")
-    alone = [add(policy, f"fresh[{j}]", [j]) for j, policy in enumerate(fresh or ())]
+    alone = [add(policy, f"fresh[{j}]", j) for j, policy in enumerate(fresh or ())]
 
     regrets, optima = stream_regrets(stream, actors, protocol, progress)
     *regions, ood = stream_regions(

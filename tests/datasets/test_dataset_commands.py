@@ -133,6 +133,11 @@ def test_a_copy_under_another_name_is_neither_listed_nor_valid(tmp_path):
 
 
 def test_a_mix_without_shares_is_refused():
+    for mix in ([0.5, 0.5], 1, {"random": 1.0}):
+        with pytest.raises(OptionError, match="must be pairs of a policy and its share"):
+            make_dataset("Default", mix=mix)
+    with pytest.raises(OptionError, match="name='3': must be"):
+        make_dataset("Default", name=3)
     with pytest.raises(OptionError, match="mix='random': must be pairs of a policy and its share"):
         make_dataset("Default", mix="random")
 

@@ -8,6 +8,7 @@ import pytest
 
 from sme_registry import SMESpec, materialize, values
 from sme_registry.datasets import DatasetRecipe, collect, positions
+from sme_registry.errors import SpecError
 
 SPEC = SMESpec(state_dim=3, action_dim=2, horizon=30, k=4, seed=4)
 
@@ -46,6 +47,13 @@ def test_positions_are_found_behind_what_the_agent_sees():
     for name in ("states", "t", "accumulated"):
         np.testing.assert_array_equal(found[name], expected[name])
     assert found["accumulated"].max() > 1.0
+
+
+def test_a_teams_rows_are_no_positions():
+    agents = [{"name": f"agent_{i}", "action_dim": 1} for i in range(2)]
+    spec = SPEC.derive(team={"agents": agents})
+    with pytest.raises(SpecError, match="of a single agent"):
+        positions(made(spec), spec)
 
 
 def test_many_states_at_different_times_keep_their_order():

@@ -130,6 +130,7 @@ def test_levels_over_time_fall_towards_the_end_of_an_episode_and_continuing_ones
         (lambda: model(PPO), {"task": "Default"}, "trained on"),
         (lambda: model(PPO), {"task": "Team2"}, "agents"),
         (lambda: model(PPO), {"states": 0}, "states=0"),
+        (lambda: model(PPO), {"seed": -1}, "seed=-1"),
         (lambda: object(), {}, "no critic"),
     ],
 )

@@ -10,6 +10,7 @@ from sme_registry.diagnosis import Subject, behaviour, diagnose, load_policy
 from sme_registry.diagnosis.behaviour import CapacityProbe, Log
 from sme_registry.diagnosis.measure import POLICY
 from sme_registry.diagnosis.questions import Comparison, Difference, label
+from sme_registry.envs import SMEEnv
 from sme_registry.errors import SMEError, UnknownNameError
 from tests.diagnosis.policies import (
     DEEP,
@@ -358,6 +359,19 @@ def test_equal_seeds_give_equal_numbers_and_another_seed_other_numbers():
     diagnosis = diagnosis_of(distracted, EXTENDED)
     assert diagnosis_of.__wrapped__(distracted, EXTENDED) == diagnosis
     assert diagnosis_of(distracted, EXTENDED, seed=1).measurements != diagnosis.measurements
+
+
+def test_on_noisy_tasks_and_with_noisy_actions_too():
+    noisy = SPEC.derive(noise={"transition": 0.3})
+    first, again = (diagnosis_of.__wrapped__(Noisy(), noisy) for _ in range(2))
+    assert first == again
+    sb3 = pytest.importorskip("stable_baselines3")
+    noise = sb3.common.noise.NormalActionNoise(np.zeros(4), 0.1 * np.ones(4))
+    agent = sb3.TD3("MlpPolicy", SMEEnv(SPEC, action_range="symmetric"), action_noise=noise)
+    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    first, again = (diagnosis_of.__wrapped__(agent, SPEC) for _ in range(2))
+    assert first.measurements.exploration_sd == again.measurements.exploration_sd
+    np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
 def test_a_payout_over_k_independent_rewards_is_explained_by_one_kth():

@@ -127,6 +127,11 @@ def test_an_action_is_the_same_in_whatever_form_it_comes():
         action.view(np.ma.MaskedArray),
     ):
         np.testing.assert_array_equal(plain.step(action)[0], other.step(same)[0])
+    for library, array in (("jax.numpy", "asarray"), ("torch", "from_numpy"), ("pandas", "Series")):
+        same = getattr(pytest.importorskip(library), array)(action)
+        np.testing.assert_array_equal(plain.step(action)[0], other.step(same)[0])
+    with pytest.raises(ActionError, match="grad"):
+        other.step(pytest.importorskip("torch").from_numpy(action).requires_grad_())
     whole = np.array([0, 1, 0, 1])
     np.testing.assert_array_equal(plain.step(whole.astype("f4"))[0], other.step(whole)[0])
 
@@ -198,6 +203,8 @@ def test_a_state_that_cannot_begin_an_episode_is_refused():
         np.testing.assert_array_equal(env.state, before)
     with pytest.raises(OptionError, match=r"unknown option.*Did you mean 'state'"):
         env.reset(options={"sate": [0, 0]})
+    with pytest.raises(OptionError, match="must be a dictionary"):
+        env.reset(options=["state"])
     np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])  # nor has it been seeded
 
 

@@ -405,6 +405,18 @@ def test_bad_input_is_refused(arguments, error, message):
         evaluate_stream([half] * 4, TWICE, PROTOCOL, fresh=[half])
 
 
+@pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
+def test_fresh_agents_do_not_see_the_phase_that_a_life_observes():
+    observed = stream_of(SPEC, SPEC.derive(seed=1), observes_phase=True)
+    life, fresh = [network(v, SPEC.state_dim + 4) for v in range(2)], [network(3), network(4)]
+    report = evaluate_stream(life, observed, PROTOCOL, fresh=fresh)
+    expected = [
+        evaluate(alone, phase.spec, PROTOCOL).regions[0].normalised_regret
+        for alone, phase in zip(fresh, observed.phases, strict=True)
+    ]
+    assert report.region().agent.fresh_normalised_regret == pytest.approx(expected)
+
+
 def test_a_life_of_more_visits_than_are_evaluated_is_refused():
     long = stream_of(SPEC, SPEC.derive(seed=1), cycles=501)
     message = "cycles × phases=.* must be at most 1,000"

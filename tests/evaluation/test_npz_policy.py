@@ -56,6 +56,17 @@ def test_a_saved_policy_is_read_again_to_the_bit_and_scores_alike(tmp_path):
             evaluate(other, SMESpec(), {"states_per_region": 50})
 
 
+def test_arrays_are_copied_as_float32_and_must_fit(tmp_path):
+    W, b = np.zeros((2, 4)), np.ones(2)
+    read = OfflinePolicy.load(OfflinePolicy([(W, b)]).save(tmp_path / "policy.npz"))
+    W[0] = b[0] = 5.0  # the caller's own are left as they were
+    np.testing.assert_allclose(read(OBSERVATIONS), 0.5 * (1 + np.tanh(1.0)), rtol=1e-6)
+    with pytest.raises(PolicyError, match=r"layers\[0\], transposed: W has shape"):
+        OfflinePolicy([(np.zeros((2, 4)), np.zeros(3))])
+    with pytest.raises(PolicyError, match="1 to 64"):
+        OfflinePolicy([])
+
+
 def stored(**changes):
     """A policy's file with some of its arrays changed; None leaves one out."""
     content = io.BytesIO()
@@ -79,7 +90,7 @@ def test_the_files_of_these_tests_are_read_where_nothing_is_wrong(tmp_path):
         (stored(about=None), "about"),
         (stored(about=np.frombuffer(b"{}", np.uint8)), "does not name its kind"),
         (stored(b1=None), "b1"),
-        (stored(W1=np.zeros((8, 9), np.float32)), r"layer 1, transposed: W has shape"),
+        (stored(W1=np.zeros((8, 9), np.float32)), r"layers\[1\], transposed: W has shape"),
         (stored(W0=np.zeros((8, 4))), "not float32"),
         (stored(b2=np.array([np.nan, 0], np.float32)), "NaN or infinity"),
         (stored(W0=np.array([[print]], object)), "not a policy"),

@@ -90,6 +90,14 @@ def test_a_reference_policy_goes_by_the_name_that_reports_use(reference):
             assert evaluated(old) == report
 
 
+def test_a_reference_policys_actions_are_in_the_unit_range():
+    policy = references.reference_policy("linear", SMESpec())
+    actions = policy(np.random.default_rng(0).random((4000, 10), np.float32))
+    assert (actions.min(), actions.max()) == (0.0, 1.0)
+    with pytest.raises(OptionError, match="Did you mean 'linear'"):
+        references.reference_policy("liner", SMESpec())
+
+
 def test_a_function_goes_by_its_module_and_name(tmp_path, monkeypatch):
     (tmp_path / "policies_for_a_test.py").write_text("def act(o):\n    return o[:, :2]\nx = 3\n")
     monkeypatch.chdir(tmp_path)
@@ -361,8 +369,17 @@ def test_onnx_files_play_as_a_team_apart_and_together(onnx, tmp_path):
     for policy, same in ((files, functions), (tmp_path / "both.onnx", lambda o: o @ both)):
         mine, theirs = evaluate(policy, team, PROTOCOL), evaluate(same, team, PROTOCOL)
         assert mine.regions[0].similarity == pytest.approx(theirs.regions[0].similarity, abs=1e-6)
+    (tmp_path / "apart").mkdir()
+    for name, file in files.items():
+        file.rename(tmp_path / "apart" / f"{name}.onnx")
+    for folder in (tmp_path / "apart", str(tmp_path / "apart")):
+        mine, theirs = evaluate(folder, team, PROTOCOL), evaluate(functions, team, PROTOCOL)
+        assert mine.policy == "apart"
+        assert mine.regions[0].similarity == pytest.approx(theirs.regions[0].similarity, abs=1e-6)
+    files = {name: tmp_path / "apart" / f"{name}.onnx" for name in files}
+    right = tmp_path / "apart" / "right_0.onnx"
     with pytest.raises(PolicyError, match=r"left_0: .*its inputs are .*5.*must be .*\[batch, 4\]"):
-        evaluate({**files, "left_0": tmp_path / "right.onnx"}, team, PROTOCOL)
+        evaluate({**files, "left_0": right}, team, PROTOCOL)
 
 
 OWN = "def act(observations):\n    return observations[:, :2]\n"

@@ -68,6 +68,18 @@ def test_a_continuing_value_goes_on_after_the_end():
     assert (on > finite).all()
 
 
+def test_nothing_goes_on_after_a_termination_at_the_last_step():
+    spec = sme_registry.SMESpec(D=0.05, horizon=1)
+    actions = policy(np.column_stack([STATES, np.zeros((5, 2))]))
+    reward = sme_registry.materialize(spec).step_reward(STATES, actions)
+    finite, on = (
+        sme_registry.values(spec, policy, STATES, gamma=0.9, horizon=horizon)
+        for horizon in ("finite", "continuing")
+    )
+    assert 0 < (reward < 0.05).sum() < len(STATES)
+    np.testing.assert_array_equal(on == finite, reward < 0.05)
+
+
 def test_a_stochastic_policy_is_averaged_over_samples():
     rng = np.random.default_rng(3)
 
