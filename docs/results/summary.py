@@ -88,7 +88,7 @@ def discounts() -> pd.DataFrame:
 
 
 def profiles() -> Iterator[pd.DataFrame]:
-    """N₀ of five runs of 20,000 steps, where each has so many, and of clones; minus PPO's."""
+    """N₀ of five runs of 20,000 steps, where each has so many, and of clones; and differences."""
     agents = [*Profile.references().values()]
     agents += [Profile.read(path) for path in RESULTS.glob("unfinished-profiles/*.json")]
     runs = [
@@ -101,7 +101,9 @@ def profiles() -> Iterator[pd.DataFrame]:
     clones["algorithm"] = "clone, " + clones["algorithm"]
     table = pd.concat([pd.DataFrame(runs), clones])
     yield paired(table, "wd_regret", "TD3", "PPO")
-    yield paired(table, "wd_regret", "SAC", "PPO")[["difference", "low", "high", "pairs", "lower"]]
+    for one, other in (("SAC", "PPO"), *((f"{name} (gamma 0)", name) for name in ("TD3", "SAC"))):
+        pairs = paired(table, "wd_regret", one, other)
+        yield pairs[["difference", "low", "high", "pairs", "lower"]].dropna().add_prefix(f"{one}: ")
 
 
 def paired(runs: pd.DataFrame, value: str, one: str, other: str) -> pd.DataFrame:
