@@ -26,7 +26,7 @@ from sme_registry.studies import run_study
 
 PARTS = Path(__file__).parent / "unfinished-profiles"
 SHORT = ("TD3 (gamma 0)", "SAC (gamma 0)")
-SHORT_AXES = ("k-5", "complexity-2", "shaping-scale-10")  # a level of each
+SHORT_AXES = ("k-5", "complexity-10", "shaping-scale-10")  # a level of each
 
 
 def classes_of(name: str) -> tuple[str, ...]:

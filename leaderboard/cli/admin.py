@@ -15,7 +15,15 @@ from rich.markup import escape
 from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.cli import results
-from leaderboard.cli.results import WITH_SEASONS, Board, BoardFolder, Json, is_url, open_board
+from leaderboard.cli.results import (
+    WITH_SEASONS,
+    Board,
+    BoardFolder,
+    Json,
+    is_url,
+    open_board,
+    warn_without_sandbox,
+)
 from leaderboard.cli.submit import DEFAULT_KEY, KeyFile, SuiteName, find_suite, own_key
 from leaderboard.documents.board import RUNS_TO_RANK, Folder
 from leaderboard.documents.signed import Receiver, SigningKey
@@ -29,7 +37,7 @@ from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import require_packages
 from sme_registry.io.markup import plural
-from sme_registry.io.terminal import Progress, err, out, print_json, print_line, print_note
+from sme_registry.io.terminal import Progress, err, out, print_json, print_line
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, Suite, SuiteFile, catalogue
 from sme_registry.training import RunRecord
 
@@ -162,11 +170,8 @@ def score(
       sme-leaderboard score board --workers 2
     """
     isolation: Isolation = "process" if unsafe_no_sandbox else available_isolation()
-    if isolation == "process" and not unsafe_no_sandbox:
-        print_note(
-            "[bold red]Policies run without a sandbox[/]: bubblewrap is not installed, so they "
-            "could read your files and use your network. Install it: apt install bubblewrap."
-        )
+    if not unsafe_no_sandbox:
+        warn_without_sandbox()
     score_waiting(board, workers, isolation)
 
 

@@ -19,6 +19,7 @@ from leaderboard.documents.board import Folder
 from leaderboard.documents.result import METRICS, RANKED, EntryRow, Estimate, Metric, Result
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError
+from leaderboard.gate.isolation import available_isolation
 from leaderboard.scoring import ranking
 from leaderboard.scoring.ranking import REASONS, RankedRow
 from leaderboard.scoring.verify import Findings
@@ -37,6 +38,7 @@ from sme_registry.io.terminal import (
     out,
     print_json,
     print_line,
+    print_note,
     print_pairs,
 )
 
@@ -415,11 +417,14 @@ def verify(
 
       sme-leaderboard verify board --contains sha256:3f2a…
     """
+    count = _rescore_count(rescore)
+    if count != 0:
+        warn_without_sandbox()
     parts = [partial(verify_seasons, published=published or ())] if WITH_SEASONS else []
     with err().status("verifying") as status:
         report = verify_board(
             board,
-            rescore=_rescore_count(rescore),
+            rescore=count,
             seed=seed,
             contains=contains,
             board=Board,
@@ -434,6 +439,15 @@ def verify(
         _print_verification(report)
     if not report.is_confirmed:
         raise typer.Exit(1)
+
+
+def warn_without_sandbox() -> None:
+    """Say that strangers' policies run with limits alone, where that is so."""
+    if available_isolation() == "process":
+        print_note(
+            "[bold red]Policies run without a sandbox[/]: bubblewrap is not installed, so they "
+            "could read your files and use your network. Install it: apt install bubblewrap."
+        )
 
 
 def _print_verification(report: Findings) -> None:

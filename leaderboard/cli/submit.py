@@ -253,7 +253,10 @@ def _expanded(patterns: list[str]) -> list[Path]:
         matches = [path]
         if not path.exists():
             root = Path(path.anchor) if path.is_absolute() else Path()
-            matches = sorted(root.glob(str(path.relative_to(path.anchor))))
+            try:
+                matches = sorted(root.glob(str(path.relative_to(path.anchor))))
+            except (ValueError, NotImplementedError) as error:
+                raise OptionError(f"runs={pattern!r}: {error}. Correct the pattern.") from None
         if not matches:
             raise OptionError(f"runs={pattern!r}: no such folder or file. Correct the path.")
         paths |= dict.fromkeys(matches)

@@ -113,9 +113,14 @@ class RankedRow:
         return own if self.first is None else self.value
 
 
-def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
-    """Every scored entry that is not withdrawn, the best first; equal ones as submitted."""
-    history = superseded(entries)
+def ranking(
+    entries: list[EntryRow], metric: Metric, history: set[str] | None = None
+) -> list[RankedRow]:
+    """Every scored entry that is not withdrawn, the best first; equal ones as submitted.
+
+    `history` are the ids that have no rank, as a later entry counts: by default `superseded`.
+    """
+    history = superseded(entries) if history is None else history
     scored = [
         (entry, entry.scores, _reason(entry, entry.scores, metric, history))
         for entry in sorted(entries, key=lambda entry: entry.sequence)
@@ -126,7 +131,7 @@ def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
     ).reshape(-1, 3)
     ranked = np.array([not reason for *_, reason in scored], dtype=bool)
     level = np.zeros(len(scored))
-    if metric == "ood_decay":
+    if metric == "ood_decay" and scored:
         regions = _regret([scores for _, scores, _ in scored])
         ends = np.maximum(ends, 0.0)
         ends[ranked] = not_above_the_better(ends[ranked], regions[ranked])

@@ -114,6 +114,11 @@ def ticket(
     season_digest, receiver = served_season(url, season)
     if repeated:
         signed = Signed[TicketRequest].read(read_file(request_file))
+        if signed.content.season != season_digest:
+            raise OptionError(
+                f"{request_file}: asks for a ticket of another season, and may have started one. "
+                "Repeat that command, or give another --out."
+            )
         signed = signed.for_receiver(receiver, signing_key)
         err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
     else:
@@ -132,9 +137,10 @@ def ticket(
     try:
         started = request_ticket(url, season, signed, signing_key)
     except Rejection as rejection:
-        # Refused is the request, which has started no ticket, or its sender: with another key, or
-        # a wrong clock.
-        if not (repeated and rejection.code in ("bad_signature", "stale_time")):
+        # Refused is the request, which has started no ticket, or before it is looked for: its
+        # sender, with another key or a wrong clock, or where it was sent to.
+        unseen = "bad_signature", "stale_time", "season_unknown", "wrong_board"
+        if not (repeated and rejection.code in unseen):
             request_file.unlink()
         raise
     started.write(out_file)

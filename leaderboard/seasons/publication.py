@@ -14,16 +14,17 @@ and scores: of offline entries from their answers, of tickets from what was play
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 from leaderboard.documents.result import RunScore
-from leaderboard.errors import BoardError, TamperedError
+from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.ranking import failed_run
 from leaderboard.scoring.verify import (
     Difference,
@@ -54,6 +55,7 @@ from leaderboard.seasons.tickets import Ticket, deadline
 from leaderboard.store import Store
 from leaderboard.web.client import Files
 from sme_registry.datasets import DatasetRecipe, SealedDataset
+from sme_registry.errors import SMEError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import (
     build_folder,
@@ -170,8 +172,20 @@ def files_of_seasons(store: Store) -> Iterator[Files]:
     assert isinstance(store, SeasonStore)
     for row in store.seasons():
         folder = store.season_folder(row.digest)
+        named = {f"published/{path.as_posix()}" for path in _published_files(row.terms)}
+        tickets = {str(each.number) for each in store.entrants(row.digest)} if row.reveal else set()
+        is_named = partial(_is_named, named, tickets)
         check = partial(check_published, row.terms, folder / "published")
-        yield Files(f"/api/seasons/{row.id}/files", folder, check)
+        yield Files(f"/api/seasons/{row.id}/files", folder, is_named, check)
+
+
+_OF_TICKET = re.compile(r"tickets/(\d+)/\w{1,99}\.(?:journal|json|challenge|npy|npz)", re.ASCII)
+
+
+def _is_named(published: Collection[str], tickets: Collection[str], path: str) -> bool:
+    """Whether a path is of a published file, or of one in the folder of a revealed ticket."""
+    ticket = _OF_TICKET.fullmatch(path)
+    return path in published or (ticket is not None and ticket[1] in tickets)
 
 
 def check_published(
@@ -287,6 +301,8 @@ class _SeasonVerifier:
             return
         master = self.store.revealed_master(self.of.digest)
         self.generate_again(master)
+        if self.published() is not None:
+            self.check_published()
         self.score_again(master)
 
     def report(self, what: str, checked: int, unchecked: int = 0, why: str = "") -> None:
@@ -311,12 +327,15 @@ class _SeasonVerifier:
         return copy if copy.is_dir() else self.folders.get(self.of.digest)
 
     def check_published(self) -> None:
-        """Before the reveal: check the published files against their digests."""
+        """Check the published files against their digests."""
         count, folder = len(self.season.published), self.published()
         if folder is None:
             self.report("data sets", 0, count, "not in this folder" * bool(count))
             return
-        check_published(self.season, folder)
+        try:
+            check_published(self.season, folder)
+        except SMEError as error:
+            raise TamperedError(f"{self.season.id}: published", str(error)) from None
         self.report("data sets, by their digests", count)
 
     def generate_again(self, master: Master) -> None:
@@ -389,9 +408,13 @@ class _SeasonVerifier:
             return
         for row in rows:
             ticket = Ticket(self.store, self.season, master, row)
-            if not ticket.is_ended:
-                self.refuse_early(row, "without the entrant's end")
-            yield ticket.score()
+            try:
+                if not ticket.is_ended:
+                    self.refuse_early(row, "without the entrant's end")
+                score = ticket.score()
+            except (OSError, Rejection) as error:
+                raise TamperedError(f"{ticket.folder}", f"cannot be scored: {error}") from None
+            yield score
 
     def contradiction(self, result: SealedResult) -> Difference | None:
         """The first value of a result that does not follow from the regrets of its runs."""

@@ -239,8 +239,11 @@ def season_rankings(
     """The rankings of a season's methods with results, one for each declared knowledge."""
     rows = [row for row in counting(store, season) if row.result is not None]
     entries = list(_methods(store, season, rows))
+    history = set[str]() if season.track == "sealed-online" else None  # every ticket counts
     return {
-        knowledge: ranking([each for each in entries if each.knowledge == knowledge], metric)
+        knowledge: ranking(
+            [each for each in entries if each.knowledge == knowledge], metric, history
+        )
         for knowledge in KNOWLEDGE
     }
 

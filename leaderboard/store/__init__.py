@@ -462,7 +462,8 @@ class Store:
         [(size,)] = self.query(
             "SELECT coalesce(sum(size), 0) FROM ("
             "SELECT size FROM object WHERE key = ?1 AND received > ?2 UNION ALL "
-            "SELECT size FROM upload WHERE key = ?1 AND time > ?2)",
+            "SELECT size FROM upload WHERE key = ?1 AND time > ?2 UNION ALL "
+            "SELECT size FROM spent WHERE key = ?1 AND time > ?2)",
             *(key, since),
         )
         return int(size)

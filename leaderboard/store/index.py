@@ -50,7 +50,10 @@ from leaderboard.store.log import (
 from sme_registry.io import is_regular
 from sme_registry.spec.document import StrictModel
 
-TIMES = (("track", "announced"), ("entry", "received"), ("object", "received"), ("upload", "time"))
+TIMES = (
+    ("track", "announced"), ("entry", "received"), ("object", "received"), ("upload", "time"),
+    ("spent", "time"),
+)  # fmt: skip
 """Tables and their columns with times of receipt, which an entry of the event "clock" corrects.
 
 What an end or a reveal was decided by stays: it has happened.
@@ -109,6 +112,9 @@ CREATE TABLE upload (
   digest TEXT NOT NULL, size INTEGER NOT NULL, key TEXT NOT NULL, time TEXT NOT NULL,
   PRIMARY KEY (digest, key)
 ) STRICT, WITHOUT ROWID;
+CREATE TABLE spent ( -- by uploads that have expired
+  key TEXT NOT NULL, size INTEGER NOT NULL, time TEXT NOT NULL
+) STRICT;
 CREATE TABLE clock (boot TEXT PRIMARY KEY, offset REAL NOT NULL) STRICT, WITHOUT ROWID;
 """
 _STATEMENTS = list(filter(None, map(str.strip, SCHEMA.split(";"))))  # as SQLite keeps them

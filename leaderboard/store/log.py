@@ -222,7 +222,8 @@ BUSY_SECONDS = 60.0
 MAX_DOCUMENT_BYTES = 16 * 2**20
 """Of a file that a board has written: a result of 10,000 failed runs has 3.3 MiB."""
 
-_UNNAMED_SECONDS = 3600.0
+_UNNAMED = datetime.timedelta(hours=1)
+_DAY = datetime.timedelta(days=1)
 _Model = TypeVar("_Model", bound=StrictModel)
 
 
@@ -468,15 +469,21 @@ def collect_garbage(
 
 
 def expire_uploads(store: Store) -> None:
-    """Remove uploads of more than an hour ago that no submission of their key has named."""
+    """Remove uploads of more than an hour ago that no submission of their key has named.
+
+    They still count towards their key's quota of a day.
+    """
     moment = datetime.datetime.fromisoformat(store.time)
-    until = utc(shifted(moment, -datetime.timedelta(seconds=_UNNAMED_SECONDS)))
+    until = utc(shifted(moment, -_UNNAMED))
     held = "SELECT 1 FROM object WHERE digest = ?1 UNION SELECT 1 FROM upload WHERE digest = ?1"
     with store.transaction() as index:
-        old = index.connection.execute(
-            "DELETE FROM upload WHERE time <= ? RETURNING digest", (until,)
+        execute = index.connection.execute
+        old = execute(
+            "DELETE FROM upload WHERE time <= ? RETURNING digest, key, size, time", (until,)
         ).fetchall()
-        for (digest,) in old:
+        index.connection.executemany("INSERT INTO spent VALUES (?, ?, ?)", (row for _, *row in old))
+        execute("DELETE FROM spent WHERE time <= ?", (utc(shifted(moment, -_DAY)),))
+        for digest, *_ in old:
             if index.one(held, digest) is None:
                 _remove(store.folder.object(digest))
 

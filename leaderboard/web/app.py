@@ -191,7 +191,7 @@ class _Routes:
         digest = _digest(digits)
 
         def read() -> bytes:
-            if not self._store.is_public(digest):
+            if not (self._store.is_public(digest) and self._store.objects.has(digest)):
                 raise RequestError("not_found", f"object={digest}: {HTTP_CODES['not_found']}.")
             return self._store.objects.read(digest)
 

@@ -18,7 +18,6 @@ import contextlib
 import functools
 import json
 import os
-import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,8 +59,6 @@ _PATIENCE = 30.0  # seconds
 _MOST = 2**24  # bytes of an answer: a result of a thousand runs has less than two million
 _MOST_LOG = 2**22  # of an answer: a hundred entries of at most 4,096 bytes, as JSON
 _CHUNK, _INODE = 2**23, 2**12  # of a file of a season; what an empty one counts as
-_PART = "[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}"
-_NAME = re.compile(f"({_PART}/){{0,9}}{_PART}")
 
 
 def submit(
@@ -192,7 +189,8 @@ class ServedBoard:
             if error.code in CODES:
                 raise Rejection(error.code, error.message) from None
             named = error.code in ("unreachable", "http", "wire")  # the client's own, with the URL
-            raise BoardError(error.message if named else f"{self.url}: {error.message}") from None
+            kind = _NotFoundError if error.code == "not_found" else BoardError
+            raise kind(error.message if named else f"{self.url}: {error.message}") from None
 
 
 def answer_for(id: str, answer: Any, url: str) -> dict[str, Any]:
@@ -212,11 +210,16 @@ def _digits(id: str) -> str:
         ) from None
 
 
+class _NotFoundError(BoardError):
+    """The server has no such thing."""
+
+
 class Files(NamedTuple):
     """Files that a server lists, and serves, below an address."""
 
     address: str
     folder: Path  # that they belong into
+    is_named: Callable[[str], bool]  # whether the log commits to a file of this path
     check: Callable[[], None]  # raises an error unless they are those that the log commits to
 
 
@@ -325,7 +328,7 @@ class _Copy:
             return
         try:
             data = self._read(f"/api/objects/{hex_of(digest)}", _MOST, digest)
-        except BoardError:
+        except _NotFoundError:
             if optional:
                 return
             raise
@@ -346,8 +349,8 @@ class _Copy:
             except (LookupError, TypeError, ValueError, OverflowError) as error:
                 raise self._refusal(f"its list of files is invalid: {error}") from None
             for path, size in listed:
-                if not _NAME.fullmatch(path):
-                    raise self._refusal(f"it lists a file of the unsafe name {path!r:.80}")
+                if not files.is_named(path):
+                    raise self._refusal(f"it lists {path!r:.80}, which its log does not name")
                 if not (without_data and path.startswith("published/")):
                     self._fetch_file(files, path, size)
             goes_on = listed and isinstance(following, int) and following > start

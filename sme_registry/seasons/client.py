@@ -162,7 +162,8 @@ class Instance:
                     f"{error.message} Call `begin` (of an environment, `reset`) to go on from the "
                     "present observation; no other process may step the instance.",
                 ) from None
-            if error.code not in ("unreachable", "wire"):  # these steps were not taken
+            # Refused, these steps were not taken; where a server fails, they may have been.
+            if error.code not in ("unreachable", "wire", "http", "internal"):
                 kept.receive(self.number, kept.head(self.number))
             raise
         steps = self._format.unpack_steps(data)

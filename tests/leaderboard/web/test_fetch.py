@@ -11,7 +11,8 @@ from leaderboard.scoring.verify import verify
 from leaderboard.seasons.publication import files_of_seasons
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
-from leaderboard.web.client import ServedBoard, fetch
+from leaderboard.web.client import ServedBoard, _Copy, fetch
+from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import EXAMPLE, SEASONS
 from tests.leaderboard.seasons.sealing import findings_of
 from tests.leaderboard.serving import serving
@@ -131,6 +132,28 @@ def test_seasons_are_copied_with_what_was_played_and_verified(seasons, tmp_path)
     assert len(verify(copy, board=SeasonStore).missing) == 6  # which the board itself lacks
 
 
+def test_files_of_policies_may_be_missing_and_nothing_else_about_them(seasons, tmp_path):
+    copy = tmp_path / "copy"
+    fetch(seasons, copy, board=SeasonStore)
+    name = sha256_of(b"policy")
+    with ServedBoard(seasons) as served:
+        begun = _Copy(served, copy, most=10**6, progress=lambda what: None)
+        begun.fetch_object(name, optional=True)
+        with pytest.raises(BoardError, match="nothing exists at this address"):
+            begun.fetch_object(name)
+        served.read = lambda *_, **__: b"policy"
+        begun = _Copy(served, copy, most=3, progress=lambda what: None)
+        with pytest.raises(BoardError, match="has sent more than 3 bytes"):
+            begun.fetch_object(name, optional=True)
+
+        def fault(*_, **__):
+            raise BoardError("gives no answer")
+
+        served.read = fault
+        with pytest.raises(BoardError, match="gives no answer"):
+            begun.fetch_object(name, optional=True)
+
+
 ENDLESS = b'{"files": [{"path": "a", "size": 1e999}], "next": null}'
 
 
@@ -168,7 +191,18 @@ def test_a_list_of_files_that_never_ends_ends(seasons, tmp_path, monkeypatch, fo
     assert len(asked) == 2  # one of each season
 
 
-ODD = ("../up", "x" * 200, "/absolute", "tickets/../../up", ".stepping", "published/.a", "a//b")
+ODD = (
+    "../up",
+    "x" * 200,
+    "/absolute",
+    "tickets/../../up",
+    ".stepping",
+    "published/.a",
+    "a//b",
+    "published/evil.py",
+    "other/run.sh",
+    "tickets/999/0.npy",
+)
 
 
 @pytest.mark.parametrize("path", ODD)
@@ -178,5 +212,5 @@ def test_a_server_names_no_file_outside_the_copy(seasons, tmp_path, monkeypatch,
         return listed % path.encode() if "/files?" in address else data
 
     answering(monkeypatch, lie)
-    with pytest.raises(BoardError, match="unsafe name"):
+    with pytest.raises(BoardError, match="which its log does not name"):
         fetch(seasons, tmp_path / "copy", board=SeasonStore, parts=[files_of_seasons])
