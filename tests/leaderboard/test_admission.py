@@ -398,3 +398,7 @@ def test_uploads_without_a_submission_expire_after_an_hour(tmp_path, key, monkey
         assert store.possesses(other.public, one)
         assert not store.possesses(key.public, one)
         assert store.total_bytes() == 300
+        assert store.uploaded_bytes(key.public, ANY_TIME) == 600  # towards the quota of its day
+        move_clock(monkeypatch, utc(after(hours=26)))
+        admission.check_upload(store, other.public, 500)
+        assert store.uploaded_bytes(key.public, ANY_TIME) == store.total_bytes() == 0

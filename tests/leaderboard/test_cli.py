@@ -272,6 +272,7 @@ def test_invalid_usage_exits_with_2():
     make_board()
     new = ("submit", "runs.json", "board", *SUBMIT)
     assert "no such folder" in fails(2, "submit", "runs/*", "board", *SUBMIT)
+    assert "Correct the pattern" in fails(2, "submit", "runs/ppo**", "board", *SUBMIT)
     assert "knowledge" in fails(2, *new, "--knowledge", "much")
     assert "CLASS=N" in fails(2, *new, "--started", "many")
     assert "--method, --submitter" in fails(2, *new[:3])

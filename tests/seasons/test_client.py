@@ -175,6 +175,27 @@ def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
     assert np.array_equal(hidden.step(third)[0], here.step(third)[0])
 
 
+@pytest.mark.parametrize("code", ["http", "internal"])
+def test_a_step_that_a_failing_server_has_taken_is_kept(server, monkeypatch, code):
+    hidden = Instance(server.url, server.ticket, lanes=2)
+    hidden.begin()
+    request = hidden._connection.request
+
+    def failing(*arguments, **options):
+        request(*arguments, **options)
+        raise SealedError(code, "the server failed")
+
+    monkeypatch.setattr(hidden._connection, "request", failing)
+    [first, second] = random_actions(2, 2)
+    with pytest.raises(SealedError, match="the server failed"):
+        hidden.step(first)
+    hidden.close()
+    resumed = Instance(server.url, server.ticket, lanes=2)
+    resumed.begin()
+    assert resumed.number == 1
+    resumed.step(second)
+
+
 def test_refusals_have_the_server_s_codes(server):
     Instance(server.url, server.ticket, 0, 2).begin()
     with pytest.raises(SealedError, match="start_conflict") as caught:  # its lanes stay the same

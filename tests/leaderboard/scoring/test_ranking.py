@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from leaderboard.documents.result import Copies, EntryRow, Estimate, Scores
+from leaderboard.documents.result import RANKED, Copies, EntryRow, Estimate, Scores
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable, superseded
 from leaderboard.web.tables import RankingFile
@@ -92,6 +92,11 @@ def test_entries_are_ordered_with_the_ranks_that_their_intervals_allow():
     ]
     equal = [entry(sequence, scores(0.3, 0.4)) for sequence in (9, 4, 7)]
     assert list(reasons(*equal)) == [4, 7, 9]  # in order of submission
+
+
+@pytest.mark.parametrize("metric", RANKED)
+def test_nothing_has_no_rank(metric):
+    assert ranking([], metric) == []
 
 
 def test_unranked_entries_have_a_reason_and_take_no_rank():

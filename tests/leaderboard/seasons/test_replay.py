@@ -90,6 +90,24 @@ def test_altered_journals_and_answers_are_found(revealed, tmp_path):
             assert path.read_bytes() == altered
             path.write_bytes(whole)
         assert replayed(store)[1] == []
+        answers, journal = folder / "0.npy", folder / "0.journal"
+        unreadable = wire.pack_table(np.full((ROWS, 1), np.nan))
+        for path, content in (
+            (answers, answers.read_bytes()[:-4]), (answers, bytes(2**20)), (answers, unreadable),
+            (answers, None), (journal, None),
+        ):  # fmt: skip
+            whole = path.read_bytes()
+            path.unlink()
+            if content is None:
+                path.symlink_to(tmp_path / "elsewhere")
+                (tmp_path / "elsewhere").write_bytes(whole)
+            else:
+                path.write_bytes(content)
+            with pytest.raises(TamperedError):
+                replayed(store)
+            path.unlink()
+            path.write_bytes(whole)
+        assert replayed(store)[1] == []
 
 
 @pytest.mark.parametrize(("lanes", "channels"), [(0, 1), (257, 1), (2**32 - 1,) * 2, (LANES, 2)])
