@@ -97,6 +97,10 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
             f"name={name!r}: must be 1 to 64 letters, digits, '_' and '-', with the version "
             f"-v{DYNAMICS_VERSION} or none."
         )
+    if short.startswith("sha256-") and short != document.content_name:
+        raise OptionError(
+            f"name={name!r}: names the document of another digest. Leave out 'sha256-'."
+        )
     if short.endswith(SYMMETRIC):
         raise OptionError(
             f"name={name!r}: must not end with {SYMMETRIC!r}, the ending of ids with actions in "

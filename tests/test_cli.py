@@ -446,6 +446,16 @@ class TestValidate:
             assert name in results[name]["error"]
         assert "8 of 9 files are invalid" in result.stderr
 
+    def test_a_task_too_large_to_certify_stops_no_other(self, tmp_path):
+        good("new", "wide.json", "--state-dim", 50_000, "--action-dim", 2)
+        good("new", "good.json", "--seed", 5)
+        result = sme("check", "wide.json", "good.json", "--json")
+        assert result.exit_code == 2
+        wide, sound = json.loads(result.stdout)
+        assert "GiB" in wide["error"]
+        assert (wide["valid"], sound["valid"]) == (False, True)
+        assert sound["certificates"][0]["passed"]
+
     def test_an_empty_folder_is_refused(self, tmp_path):
         (tmp_path / "empty").mkdir()
         assert "no .json" in refused("check", "empty")

@@ -93,6 +93,13 @@ def test_decay_curve_shows_the_reports_numbers_and_every_reference(report):
     assert figure.get_suptitle() == f"SME/{report.spec.content_name}"
 
 
+def test_a_decay_below_0_is_within_its_axes():
+    deep = evaluate("linear", "Complexity50", {"states_per_region": 500, "epsilons": [0.5, 1.0]})
+    axes = plots.decay_curve(deep, measures=["similarity_decay"]).axes[0]
+    lowest = min(line.get_ydata().min() for line in axes.lines if len(line.get_ydata()) == 3)
+    assert axes.get_ylim()[0] < lowest < 0
+
+
 def test_figures_of_one_task_name_it(report):
     figure = plots.similarity_map(half, "Plane1", resolution=4)
     assert "half on SME/Plane1-v1, L = 1" in figure.get_suptitle()
@@ -219,6 +226,7 @@ def test_the_episodes_of_parallel_lanes_give_one_increasing_line():
         ("step,regret\n1,x\n", "must have numbers for step and regret"),
         ("step,regret\n1,nan\n", "must have numbers for step and regret"),
         (None, "cannot be read"),
+        ("x" * 200_000, "cannot be read"),
     ],
 )
 def test_training_curve_rejects_invalid_logs(tmp_path, content, message):

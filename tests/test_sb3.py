@@ -322,6 +322,16 @@ def test_a_second_learn_continues_the_episodes_or_begins_new_ones():
     model.learn(8, callback=callback)
     model.learn(8, callback=callback)
     assert len(callback.episodes) == 2
+    model.set_env(vec_env("batch"))  # whose episodes begin anew
+    model.learn(16, callback=callback, reset_num_timesteps=False)
+    assert [e.length for e in callback.episodes[2:]] == [8, 8]
+
+
+def test_the_return_is_that_of_the_task_and_not_a_normalised_one():
+    callback = RegretCallback()
+    ppo(VecNormalize(vec_env("batch"))).learn(32, callback=callback)
+    for episode in callback.episodes:
+        assert episode.episode_return == pytest.approx(8 * (1 - episode.regret), abs=1e-5)
 
 
 def test_a_teams_agents_have_their_own_regret():

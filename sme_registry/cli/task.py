@@ -300,7 +300,13 @@ def check(
             yield result
             result["certificates"] = []
             for label, spec in () if files_only else tasks:
-                certificate = certify(spec, seed=seed)
+                try:
+                    certificate = certify(spec, seed=seed)
+                except SMEError as error:  # such as too large a task; the next files are checked
+                    passed.append(False)
+                    result |= {"valid": False, "error": f"{label}: {error}"}
+                    print_note(f"[red]not certified[/] {escape(result['error'])}")
+                    continue
                 passed.append(certificate.passed)
                 result["certificates"].append({"task": label, **certificate.to_dict()})
                 if not json:

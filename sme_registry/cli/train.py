@@ -33,7 +33,7 @@ from sme_registry.errors import OptionError, SMEError
 from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.io import check_new, read_json
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import Progress, count, err, print_line, print_note
+from sme_registry.io.terminal import Progress, count, err, print_json, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -291,10 +291,15 @@ def _train_on_data(options: Settings, data: str) -> None:
         if is_sealed(data):
             if options.out_folder is None:
                 raise OptionError("--out: is required with a sealed data set: the policy's .npz.")
+            if options.out_folder.suffix != ".npz":
+                raise OptionError(f"--out {options.out_folder}: must end in .npz, as a policy.")
             check_new(options.out_folder, force=options.force)
             policy = train_sealed(data, **arguments, progress=progress.update)
             policy.save(options.out_folder)
-            print_line(escape(str(options.out_folder)))
+            if options.json:
+                print_json({"policy": str(options.out_folder)})
+            else:
+                print_line(escape(str(options.out_folder)))
             return
         dataset = open_dataset(data)
         name = f"{dataset.id.rsplit('/', 1)[-1]}-{algorithm}-seed{options.seed}"

@@ -87,7 +87,7 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
     with _writing(path):
         # As an absolute path, so that there is an existing parent. By a file rather than
         # `os.access`, which does not see read-only file systems.
-        parent = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
+        parent = next(filter(os.path.lexists, path.absolute().parents), path)
         probe = temporary_beside(parent / path.name)
         os.close(os.open(probe, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         os.unlink(probe)

@@ -254,9 +254,9 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     """The rows of an episodes.csv, without one that was cut short when the run was killed."""
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
+        rows: list[dict[str, Any]] = list(csv.DictReader(io.StringIO(text)))
+    except (OSError, ValueError, csv.Error) as error:
         raise OptionError(f"{path}: cannot be read: {error}. Give an episodes.csv.") from None
-    rows: list[dict[str, Any]] = list(csv.DictReader(io.StringIO(text)))
     return rows[:-1] if rows and None in rows[-1].values() else rows
 
 

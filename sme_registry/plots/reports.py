@@ -181,7 +181,8 @@ def _label_axes(axes: Axes, reports: Sequence[EvaluationReport], measure: str) -
     if len(marks) <= 12:
         axes.set_xticks(marks, [f"{level:g}" if level > 0 else "WD" for level in marks])
     low, high = axes.get_ylim()
-    axes.set_ylim(min(low, 0.5) if measure == "similarity" else 0.0 - 0.03 * high, high)
+    least = min(axes.dataLim.y0, 0.0) - 0.03 * high  # of a decay below 0, too
+    axes.set_ylim(min(low, 0.5) if measure == "similarity" else least, high)
 
 
 def reward_against_cost(

@@ -16,11 +16,13 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar,
 
 import rfc8785
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
     GetJsonSchemaHandler,
+    JsonValue,
     PrivateAttr,
     SerializerFunctionWrapHandler,
     ValidationError,
@@ -372,6 +374,18 @@ class Document(StrictModel):
     def digest(self) -> str:
         """`sha256:` and 64 hex digits: the identity of this document."""
         return sha256_of(self.canonical_json())
+
+
+def _writable(value: dict[str, Any]) -> dict[str, Any]:
+    """A value whose canonical JSON tells it from others: without infinities, NaN and 2⁵³ + 1."""
+    try:
+        rfc8785.dumps(value)
+    except rfc8785.CanonicalizationError as error:
+        raise ValueError(f"must be plain, finite JSON: {error}") from None
+    return value
+
+
+PlainJson = Annotated[dict[str, JsonValue], AfterValidator(_writable)]
 
 
 class NamedDocument(Document):

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field, JsonValue, model_validator
+from pydantic import Field, model_validator
 
 from sme_registry.errors import OptionError, SpecError
 from sme_registry.spec.document import (
@@ -20,6 +20,7 @@ from sme_registry.spec.document import (
     Document,
     Integer,
     Name,
+    PlainJson,
     SchemaVersion,
     StrictModel,
     check_names,
@@ -61,7 +62,7 @@ class StudyAlgorithm(StrictModel):
 
     name: Annotated[str, matching(_NAME, "letters, digits, spaces and . _ + ( ) -", max_length=64)]
     uses: Annotated[str, Field(min_length=1, max_length=200)]
-    hyperparameters: dict[str, JsonValue] = Field(default_factory=dict)
+    hyperparameters: PlainJson = Field(default_factory=dict)
     action_range: ActionRange = "symmetric"
     steps: Steps | None = None
     source: Digest | None = None
@@ -99,7 +100,7 @@ class Cell(Document):
     stream: StreamSpec | None = None
     uses: str
     source: Digest | None = None
-    hyperparameters: dict[str, JsonValue]
+    hyperparameters: PlainJson
     action_range: ActionRange
     seed: Annotated[Integer, Field(ge=0, lt=2**32)]
     steps: Steps

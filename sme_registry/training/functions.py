@@ -161,7 +161,7 @@ class FunctionLearner(Learner):
         return self._env.seconds
 
     def learn(self, watch: Watch) -> None:
-        run, self._env.on_steps = self.run, watch.on_steps
+        run, self._env.on_steps, self._env.on_reset = self.run, watch.on_steps, watch.on_reset
         self._env.reset(seed=run.seed)  # so that episodes without a seed are reproducible
         with working_directory_importable():
             trained = self._function(self._env, run.steps, run.seed, **self.hyperparameters)
@@ -199,6 +199,11 @@ class _LimitedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._limit, self._named = limit, named
         self.steps, self.seconds = 0, 0.0
         self.on_steps: Callable[[Steps], None] = lambda steps: None
+        self.on_reset: Callable[[], None] = lambda: None
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        self.on_reset()
+        return self.env.reset(**options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         if self.steps >= self._limit:

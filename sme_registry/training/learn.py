@@ -71,6 +71,9 @@ class Watch:
     def on_steps(self, steps: Steps) -> None:
         """The learner's environments have taken one or more steps."""
 
+    def on_reset(self) -> None:
+        """The learner begins an episode, and forgets one that has not ended."""
+
     def on_visit(self, visit: int) -> None:
         """A visit of a stream's phase has ended."""
 
@@ -222,6 +225,9 @@ class RunLog(Watch):
 
     def prepare(self, note: str) -> None:
         self._progress.prepare(note)
+
+    def on_reset(self) -> None:
+        self._sums.begin()
 
     def on_steps(self, steps: Steps) -> None:
         finished = self._sums.add(*steps)

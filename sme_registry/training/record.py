@@ -27,7 +27,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import (
     Field,
-    JsonValue,
     SerializerFunctionWrapHandler,
     model_serializer,
 )
@@ -36,7 +35,7 @@ from sme_registry.envs.episodes import Episode, EpisodeSafety
 from sme_registry.errors import OptionError
 from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
-from sme_registry.spec.document import Integer, Real, StrictModel, without_empty
+from sme_registry.spec.document import Integer, PlainJson, Real, StrictModel, without_empty
 from sme_registry.training.algorithms import BACKENDS, parse_uses
 
 RECORD = "run.json"
@@ -105,7 +104,7 @@ class RunRecord(StrictModel):
     stream_digest: str = ""
     task: str = ""
     algorithm: str
-    hyperparameters: dict[str, JsonValue] = Field(default_factory=dict)
+    hyperparameters: PlainJson = Field(default_factory=dict)
     device: str = ""
     source: str = ""
     seed: Integer
@@ -189,7 +188,7 @@ def read_episodes(path: Path) -> list[Episode]:
     """All complete rows; one that was cut off by a kill is skipped."""
     try:
         rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise OptionError(f"{path}: cannot be read: {error}. Give an episodes.csv.") from None
     head = rows[0] if rows else []
     columns, others = tuple(head[: len(COLUMNS)]), tuple(head[len(COLUMNS) :])

@@ -208,6 +208,8 @@ def test_a_symmetric_name_is_not_that_of_a_task():
         sme_registry.make("DefalutSymmetric")
     with pytest.raises(OptionError, match="must not end with 'Symmetric'"):
         sme_registry.register(SMESpec(k=7), "MineSymmetric")
+    with pytest.raises(OptionError, match="names the document of another digest"):
+        sme_registry.register(SMESpec(k=3), SMESpec(k=7).content_name)
     sme_registry.register(SMESpec(k=7, seed=123), "Seven")
     env = gymnasium.make("SME/SevenSymmetric-v1")
     assert env.unwrapped.sme_spec == SMESpec(k=7, seed=123)

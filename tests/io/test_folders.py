@@ -14,6 +14,8 @@ from sme_registry.io import build_folder, check_new, claim_folder, file_lock, is
 
 def test_an_existing_path_is_refused_without_force(tmp_path):
     assert check_new(tmp_path / "new") == tmp_path / "new"
+    with pytest.raises(OptionError, match="cannot be written"):
+        check_new("/", force=True)
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     for path in (tmp_path, tmp_path / "link"):
         with pytest.raises(OptionError, match=r"already exists\. Use --force to replace it"):

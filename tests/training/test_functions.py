@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -42,6 +43,13 @@ def early(env, steps, seed):
 
 def greedy(env, steps, seed):
     return centre(env, steps + 1, seed)
+
+def restless(env, steps, seed):
+    for length in (5, 10, 10):
+        env.reset()
+        for _ in range(length):
+            env.step(np.zeros(3, np.float32))
+    return lambda observations: np.zeros((len(observations), 3))
 
 def nothing(env, steps, seed):
     return None
@@ -224,6 +232,18 @@ def test_train_writes_the_files_of_a_run(module):
     assert [episode.step for episode in result.episodes] == [10, 20, 30]
     assert not result.model_path.exists()
     assert json.loads((result.folder / "run.json").read_text())["status"] == "finished"
+
+
+def test_an_episode_that_a_reset_breaks_off_is_not_logged():
+    result = train(SPEC, algorithm=uses("restless"), steps=25, folder="run", protocol=PROTOCOL,
+                   progress=False)  # fmt: skip
+    assert [(each.step, each.length) for each in result.episodes] == [(15, 10), (25, 10)]
+
+
+@pytest.mark.parametrize("value", [math.inf, 2**53 + 1, "\ud800"])
+def test_hyperparameters_are_those_that_a_digest_tells_apart(value):
+    with pytest.raises(SpecError, match=r"hyperparameters=.*must be plain, finite JSON"):
+        cell(hyperparameters={"level": value})
 
 
 def test_a_model_of_sb3_is_a_policy_and_is_kept():
