@@ -61,16 +61,16 @@ def list_(
         name: catalogue.entries(model) for name, model in KINDS.items() if kind in (None, name)
     }
     groups = [[file for file in files if tags <= set(file.tags)] for files in catalogued.values()]
-    if not any(groups):
+    if json:
+        print_json([summary(file) for group in groups for file in group])
+    elif any(groups):
+        print_tables(catalogue_table(group) for group in groups if group)
+    else:
         used = sorted({tag for files in catalogued.values() for file in files for tag in file.tags})
         raise UnknownNameError(
             f"--tag {' --tag '.join(sorted(tags))}: nothing in the catalogue has "
             f"{'this tag' if len(tags) == 1 else 'all of these tags'}. Tags: {', '.join(used)}."
         )
-    if json:
-        print_json([summary(file) for group in groups for file in group])
-    else:
-        print_tables(catalogue_table(group) for group in groups if group)
 
 
 def summary(file: Envelope) -> dict[str, Any]:
