@@ -247,6 +247,8 @@ def continual() -> Iterator[Any]:
     of_lives = lives.groupby([*place, "visit"])["fresh_normalised_regret"]
     fresh.update(of_lives.agg(lambda runs: stats.trim_mean(runs, 0.25)).unstack())
     yield fresh.round(2)
+    small = pd.read_csv(RESULTS / "continual" / "buffer.csv").groupby("visit")
+    yield small["normalised_regret"].agg(["mean", "min", "max"]).round(2)
     for metric in OF_TRAINING:
         yield by_visit[metric].round(2)
     tasks = [phase.spec for phase in load("Switch5").phases]

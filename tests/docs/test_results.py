@@ -63,6 +63,7 @@ def part(page, begin, end):
         ("foresight", "| misleading − control", "- **On the plain"),
         ("foresight", "## Noise", "## What is missing"),
         ("continual", "| | | N at visits", "![Plasticity"),
+        ("continual", "| N on the visit's own task", "From visit 2 on"),
         ("agents", "JAX minus SB3 in N₀", "Three runs of TD3"),
         ("offline", "## Quality of the data", "## Ours and d3rlpy's"),
         ("limits_and_distractors", "## Which distractors", "![Step reward against cost"),
