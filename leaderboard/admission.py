@@ -50,13 +50,12 @@ from leaderboard.gate.isolation import Isolation, isolation_for_own
 from leaderboard.gate.networks import constant_onnx, optimal_onnx
 from leaderboard.gate.sandbox import Confined, widths
 from leaderboard.store import Store, unknown_submission
-from leaderboard.store.log import expire_uploads
+from leaderboard.store.log import DAY, expire_uploads
 from sme_registry.io import sha256_of
 from sme_registry.spec import SMESpec
 
 UPLOAD_MINUTES = 10
 MINUTES_AHEAD = 10
-_DAY = datetime.timedelta(days=1)
 _HEADER = re.compile(
     r"SME-Ed25519 key=([0-9a-f]{64}),"
     r"(?:board=([0-9a-f]{64}),)?"
@@ -118,7 +117,7 @@ _moment = datetime.datetime.fromisoformat
 
 def _a_day_ago(store: Store) -> str:
     """After which submissions and uploads count towards a day's quotas."""
-    return utc(shifted(_moment(store.time), -_DAY))
+    return utc(shifted(_moment(store.time), -DAY))
 
 
 def check_upload(store: Store, key: str, size: int) -> None:
@@ -281,7 +280,7 @@ def check_entrant(store: Store, submitter: Submitter, size: int) -> None:
         return
     times = store.submission_times(key, _a_day_ago(store))
     if len(times) >= most:
-        free = shifted(_moment(times[-most]), _DAY)
+        free = shifted(_moment(times[-most]), DAY)
         raise Rejection(
             "quota",
             f"key={key[:16]}…: has sent {len(times)} of {most} submissions within 24 hours. Send "

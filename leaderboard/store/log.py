@@ -223,7 +223,7 @@ MAX_DOCUMENT_BYTES = 16 * 2**20
 """Of a file that a board has written: a result of 10,000 failed runs has 3.3 MiB."""
 
 _UNNAMED = datetime.timedelta(hours=1)
-_DAY = datetime.timedelta(days=1)
+DAY = datetime.timedelta(days=1)  # of the quotas of a key
 _Model = TypeVar("_Model", bound=StrictModel)
 
 
@@ -482,7 +482,7 @@ def expire_uploads(store: Store) -> None:
             "DELETE FROM upload WHERE time <= ? RETURNING digest, key, size, time", (until,)
         ).fetchall()
         index.connection.executemany("INSERT INTO spent VALUES (?, ?, ?)", (row for _, *row in old))
-        execute("DELETE FROM spent WHERE time <= ?", (utc(shifted(moment, -_DAY)),))
+        execute("DELETE FROM spent WHERE time <= ?", (utc(shifted(moment, -DAY)),))
         for digest, *_ in old:
             if index.one(held, digest) is None:
                 _remove(store.folder.object(digest))

@@ -348,13 +348,14 @@ class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # unty
         self.episodes: list[Episode] = []
         self._sums: Episodes | None = None
         self._env: Any = None
+        self._normaliser: Any = None
         self._agents: Sequence[str] = ()
 
     def _on_training_start(self) -> None:
         env: Any = self.training_env
         # A second `learn` in the same environments without a reset continues the episodes.
         if self._env is not env or self.locals.get("reset_num_timesteps", True):
-            self._env = env
+            self._env, self._normaliser = env, unwrap_vec_normalize(env)
             agents = getattr(env, "agents", ())
             self._agents, n = agents if len(agents) > 1 else (), max(1, len(agents))
             steps = int(self.model.num_timesteps) // n
@@ -365,8 +366,8 @@ class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # unty
     def _on_step(self) -> bool:
         assert self._sums is not None
         rewards, dones, infos = (self.locals[name] for name in ("rewards", "dones", "infos"))
-        if (normaliser := unwrap_vec_normalize(self._env)) is not None:
-            rewards = normaliser.get_original_reward()
+        if self._normaliser is not None:
+            rewards = self._normaliser.get_original_reward()
         terminated = [not info.get("TimeLimit.truncated", False) for info in infos]
         for episode in self._sums.add(rewards, info_of_envs(infos), terminated, dones):
             self.episodes.append(episode._replace(episode=len(self.episodes) + 1))
