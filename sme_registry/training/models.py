@@ -36,7 +36,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sme_registry.envs.episodes import Episode, info_of_envs
-from sme_registry.errors import OptionError, PolicyError
+from sme_registry.errors import OptionError, PolicyError, SMEError
 from sme_registry.evaluation import Perceptron, Policy
 from sme_registry.evaluation.models import saved_sb3, torch_policy
 from sme_registry.evaluation.policies import TeamPolicy
@@ -82,11 +82,7 @@ def new_model(
             policy = policy_alias(algorithm)
             model = algorithm(policy, env, seed=seed, device="cpu", **settings)
         except (AssertionError, MemoryError, TypeError, ValueError) as error:
-            raise OptionError(
-                f"algorithm={name!r}: rejects the task or the hyperparameters "
-                f"{sorted(hyperparameters)}: {error}. Change them, or create the learner in a "
-                "function and give module:function."
-            ) from error
+            raise _rejected(name, hyperparameters, error) from error
     else:
         try:
             inspect.signature(algorithm).bind(env, seed=seed, **settings)
@@ -105,6 +101,14 @@ def new_model(
     if is_sb3(model):
         silence(model)
     return model
+
+
+def _rejected(name: str, hyperparameters: Iterable[str], error: Exception) -> OptionError:
+    """The error for what an algorithm of Stable-Baselines3 cannot learn with."""
+    return OptionError(
+        f"algorithm={name!r}: rejects the task or the hyperparameters {sorted(hyperparameters)}: "
+        f"{error}. Change them, or create the learner in a function and give module:function."
+    )
 
 
 def new_sb3_model(
@@ -337,7 +341,14 @@ class SB3Learner(Learner):
 
         self.env.on_steps = on_steps
         if first_step < self.run.steps:
-            self._learn(watch, first_step)
+            try:
+                self._learn(watch, first_step)
+            except (SMEError, OSError, MemoryError):
+                raise
+            except Exception as error:  # of Stable-Baselines3, which checks few hyperparameters
+                if not (self._of_sb3 and self.run.hyperparameters):
+                    raise
+                raise _rejected(self.name, self.run.hyperparameters, error) from error
         watch.on_pause()
         if visits is not None:  # the last one ends with the training
             visits.finish(self.steps)

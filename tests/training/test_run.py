@@ -135,6 +135,19 @@ def test_weights_that_are_not_finite_end_the_run(algorithm, tmp_path):
         short(tmp_path, algorithm=algorithm, resume=True)
 
 
+@pytest.mark.parametrize("changes", [{}, {"task": "Team4", "independent": True, "num_envs": 1}])
+def test_hyperparameters_that_only_fail_in_the_training_are_named(changes, tmp_path):
+    settings = {"n_steps": 16, "batch_size": 16, "n_epochs": 0}
+    with pytest.raises(OptionError, match=r"algorithm='PPO': rejects .*'n_epochs'.*: .+\. Change"):
+        short(tmp_path, algorithm="PPO", hyperparameters=settings, **changes)
+
+
+@pytest.mark.parametrize(("name", "value"), [("action_noise", 0.1), ("policy_delay", 0)])
+def test_so_are_those_of_off_policy_algorithms(name, value, tmp_path):
+    with pytest.raises(OptionError, match=rf"algorithm='TD3': rejects .*'{name}'.*: .+\. Change"):
+        short(tmp_path, hyperparameters={"learning_starts": 1, name: value})
+
+
 @pytest.mark.parametrize("algorithm", ["SAC", "DDPG"])  # PPO below
 def test_every_algorithm_trains(algorithm, tmp_path):
     result = short(tmp_path, algorithm=algorithm, steps=120, num_envs=2, hyperparameters=NARROW)
