@@ -314,6 +314,7 @@ class TestShow:
             (("nowhere.json",), "cannot be read"),
             ((), "Give a name"),
             (("Default", "--json-schema", "spec"), "one or the other"),
+            (("--json-schema", "spec", "--digests"), "one or the other"),
         ],
     )
     def test_bad_input(self, arguments, message):

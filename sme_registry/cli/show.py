@@ -190,8 +190,9 @@ def show(
       sme show --json-schema env-file > env-file.schema.json
     """
     if json_schema is not None:
-        if name is not None:
-            raise OptionError(f"{name!r}: --json-schema takes no name. Give one or the other.")
+        if name is not None or digests:
+            given = "--digests" if name is None else repr(name)
+            raise OptionError(f"{given}: is not for --json-schema. Give one or the other.")
         schema = _SCHEMAS[json_schema].model_json_schema()
         print_json({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema})
         return

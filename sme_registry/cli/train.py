@@ -215,6 +215,8 @@ def train(
     if options.data is not None:
         foreign = (*_OF_A_TASK, "suite", *_OF_A_SUITE, *_OF_AN_ENVIRONMENT)
         only_with(context, foreign, "is not for --data. Leave one of them out")
+        if is_sealed(options.data):
+            only_with(context, ("protocol",), "is of an evaluation, and sealed data have none")
         _train_on_data(options, options.data)
     elif options.suite is not None:
         others = (*_OF_A_TASK, "seed", "force")

@@ -304,6 +304,7 @@ class OfflineEvaluation(StrictModel):
     similarity: Real  # mean r̃ over all steps of all episodes, and its standard deviation
     similarity_sd: Real
     episode_return: Real  # mean over the episodes
+    regret: Real | None = None  # mean over all steps; None in records without it, of before 1.0
     losses: dict[str, Real]  # terms of the loss of the last batch, by name
 
 

@@ -144,6 +144,7 @@ def train_offline(
                 similarity=result.per_step(result.similarity),
                 similarity_sd=result.similarity_sd,
                 episode_return=result.episode_return.mean(),
+                regret=result.per_step(result.regret),
                 losses=learner.losses,
             )
         )

@@ -258,7 +258,7 @@ def _run_offline(cell: Cell, entry: Entry, progress: Report) -> CellResult:
     learned, T = result.record, cell.spec.horizon
     record = Record((cell,), 1, len(learned.evaluations), time.thread_time)
     for k, each in enumerate(learned.evaluations):
-        row = each.step, each.episode_return, 1.0 - each.episode_return / T, each.similarity, T
+        row = each.step, each.episode_return, each.regret, each.similarity, T
         record.evaluation(k, np.array(row)[:, None])
     training = learned.cpu_ms_per_step * cell.steps / 1e3
     timing = Timing(

@@ -319,3 +319,4 @@ def test_the_command_writes_a_policy(sealed, tmp_path):
         policy(sealed.observations[:8]), expected(sealed.observations[:8])
     )
     assert str(target) in refused(*command).replace("\n", "")
+    assert "--protocol: is of" in refused(*command, "--force", "--protocol", "quick-v1")

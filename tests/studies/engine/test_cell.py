@@ -257,6 +257,15 @@ def test_a_cell_learns_from_the_data_of_its_seed_and_is_judged_as_every_cell(lea
     assert (again.curve, again.report, again.offline) == (done.curve, done.report, done.offline)
 
 
+def test_the_regret_of_an_offline_cell_is_exact_where_returns_are_shaped():
+    plain = SMESpec(state_dim=2, action_dim=1, seed=1)
+    curves = [  # of the same clone: of rewards it learns nothing
+        run_cell(offline(spec=spec)).curve for spec in (plain, plain.derive(shaping={"scale": 9.0}))
+    ]
+    assert curves[0].regret == curves[1].regret
+    assert curves[0].episode_return != pytest.approx(curves[1].episode_return)
+
+
 @pytest.mark.parametrize("uses", ["offline:bc", "PPO"])
 def test_cells_have_limits_and_distractors_and_repeat_to_the_bit(uses):
     observed = {"distractors": 3, "mixing": "orthogonal"}
