@@ -35,6 +35,7 @@ OF_LIVES = (
     "plasticity_ratio",
 )
 OF_TRAINING = "learning_transfer", "online_regret"
+ALGORITHMS = "PPO", "TD3", "SAC"
 MARGIN = 0.02  # of N₀, within which two implementations count as equal
 
 
@@ -55,11 +56,11 @@ def in_cube(lives: pd.DataFrame) -> pd.DataFrame:
 
 
 def rows(*path: str) -> pd.DataFrame:
-    """The rows of a page, with `decay_1` and `decay_5`: (r̃_WD − r̃_m)/r̃_WD in per cent."""
+    """The rows of a page, with `lost_m`, r̃_WD − r̃_m in points, and `decay_m`, its share in %."""
     runs = pd.read_csv(RESULTS.joinpath(*path))
-    for m in (1, 5):
-        lost = runs["similarity_0"] - runs[f"similarity_{m}"]
-        runs[f"decay_{m}"] = 100.0 * lost / runs["similarity_0"]
+    for m in range(1, 6):
+        runs[f"lost_{m}"] = 100.0 * (runs["similarity_0"] - runs[f"similarity_{m}"])
+        runs[f"decay_{m}"] = runs[f"lost_{m}"] / runs["similarity_0"]
     return runs
 
 
@@ -81,10 +82,11 @@ def each_run(runs: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def discounts() -> pd.DataFrame:
-    """PPO's N₀ by γ, and of γ = 0 minus 0.99 the mean over pairs by instance, with its interval."""
+def discounts() -> Iterator[pd.DataFrame]:
+    """PPO's N₀ by γ, γ = 0 minus 0.99 over pairs by instance, and what each class costs them."""
     runs = pd.concat([rows("ablations-in-jax", f"{name}.csv") for name in ("runs", "runs-gamma")])
-    return paired(runs, "normalised_regret_0", "PPO (gamma 0)", "PPO")
+    yield paired(runs, "normalised_regret_0", "PPO (gamma 0)", "PPO")
+    yield costs(runs[runs["algorithm"] != "PPO (gamma 0.9)"], "normalised_regret_0")
 
 
 def profiles() -> Iterator[pd.DataFrame]:
@@ -101,7 +103,8 @@ def profiles() -> Iterator[pd.DataFrame]:
     clones["algorithm"] = "clone, " + clones["algorithm"]
     table = pd.concat([pd.DataFrame(runs), clones])
     yield paired(table, "wd_regret", "TD3", "PPO")
-    for one, other in (("SAC", "PPO"), *((f"{name} (gamma 0)", name) for name in ("TD3", "SAC"))):
+    yield costs(table[table["algorithm"].isin(["PPO", "PPO (gamma 0)"])], "wd_regret")
+    for one, other in (("SAC", "PPO"), *((f"{name} (gamma 0)", name) for name in ALGORITHMS)):
         pairs = paired(table, "wd_regret", one, other)
         yield pairs[["difference", "low", "high", "pairs", "lower"]].dropna().add_prefix(f"{one}: ")
 
@@ -112,33 +115,67 @@ def paired(runs: pd.DataFrame, value: str, one: str, other: str) -> pd.DataFrame
         index=["class_name", "run"], columns="algorithm", values=value, sort=False
     )
     change = (wide[one] - wide[other]).groupby(level=0, sort=False)
+    lower = change.apply(lambda pairs: (pairs < 0).sum())
+    means = wide.groupby(level=0, sort=False).mean()
+    return means.join(with_interval(change)).assign(lower=lower).round(2)
+
+
+def costs(runs: pd.DataFrame, value: str) -> pd.DataFrame:
+    """What each class costs an algorithm: its value minus the default's, over pairs by run."""
+    wide = runs.pivot_table(
+        index=["class_name", "run"], columns="algorithm", values=value, sort=False
+    )
+    change = wide.sub(wide.loc["default"], level="run")
+    tables = {name: with_interval(change[name].groupby(level=0, sort=False)) for name in change}
+    return pd.concat(tables, axis=1).round(2)
+
+
+def with_interval(change: Any) -> pd.DataFrame:
+    """The mean of each group of differences, with t's interval."""
     n, mean = change.count(), change.mean()
     arm = stats.t.ppf(0.975, n - 1) * change.std() / np.sqrt(n)
-    table = wide.groupby(level=0, sort=False).mean()
-    columns = {"difference": mean, "low": mean - arm, "high": mean + arm, "pairs": n}
-    lower = (change.apply(lambda pairs: (pairs < 0).sum())).rename("lower")
-    return table.assign(**columns, lower=lower).round(2)
+    return pd.DataFrame({"difference": mean, "low": mean - arm, "high": mean + arm, "pairs": n})
 
 
 def decays(runs: pd.DataFrame) -> pd.DataFrame:
     """What is lost outside, and how it goes with r̃_WD: ρ over runs, and over ranks in classes."""
-    depth = runs["complexity"].map(lambda L: "L = 1" if L == 1 else "L > 1")
-    parts = pd.concat([runs.assign(tasks="all"), runs.assign(tasks=depth)])
+    depths = {"all": (1, 50), "L = 1": (1, 1), "L > 1": (2, 50)}
+    depths |= {"L = 2, 3": (2, 3), "L = 10, 20, 50": (10, 50)}
+    shells = [f"decay_{m}" for m in range(1, 6)]
     table = {}
-    for key, group in parts.groupby(["algorithm", "tasks"], sort=False):
-        pair = group[["similarity_0", "decay_5"]]
-        ranks = pair.groupby(group["class_name"]).rank()
-        table[key] = {
-            "runs": len(group),
-            "decay_1": group["decay_1"].mean(),
-            "sd_1": group["decay_1"].std(),
-            "decay_5": group["decay_5"].mean(),
-            "sd_5": group["decay_5"].std(),
-            "ρ within classes": ranks.corr().iloc[0, 1],
-            "ρ pooled": stats.spearmanr(*pair.to_numpy().T).statistic,
-            **cosines(*pair.to_numpy().T),
-        }
+    for algorithm, of_algorithm in runs.groupby("algorithm", sort=False):
+        for tasks, ends in depths.items():
+            group = of_algorithm[of_algorithm["complexity"].between(*ends)]
+            pair = group[["similarity_0", "decay_5"]]
+            within = group.groupby("class_name")[[*pair, "similarity_5"]].rank().corr()
+            table[algorithm, tasks] = {
+                "runs": len(group),
+                "decay_1": group["decay_1"].mean(),
+                "sd_1": group["decay_1"].std(),
+                "decay_5": group["decay_5"].mean(),
+                "sd_5": group["decay_5"].std(),
+                "all shells": group[shells].mean(axis=None),
+                "points_5": group["lost_5"].mean(),
+                "ρ within classes": within.loc["similarity_0", "decay_5"],
+                "ρ pooled": stats.spearmanr(*pair.to_numpy().T).statistic,
+                "ρ of r̃ outside": within.loc["similarity_0", "similarity_5"],
+                **cosines(*pair.to_numpy().T),
+            }
     return pd.DataFrame(table).T.round(2)
+
+
+def decays_of_classes(runs: pd.DataFrame) -> pd.DataFrame:
+    """Of each class the decay in the outermost shell, how many runs lose, and ρ with r̃_WD."""
+    of_classes = runs.groupby("class_name", sort=False)
+    return pd.DataFrame(
+        {
+            "decay_5": of_classes["decay_5"].mean(),
+            "lose": of_classes["decay_5"].agg(lambda decay: (decay > 0).sum()),
+            "ρ": of_classes[["similarity_0", "decay_5"]].apply(
+                lambda runs: stats.spearmanr(*runs.to_numpy().T).statistic
+            ),
+        }
+    ).round(2)
 
 
 def cosines(x: np.ndarray, y: np.ndarray, draws: int = 2_000) -> dict[str, float]:
@@ -178,7 +215,7 @@ def equality(runs: pd.DataFrame) -> pd.DataFrame:
         index=["class_name", "run"], columns="algorithm", values="normalised_regret_0", sort=False
     )
     table = {}
-    for algorithm in ("PPO", "TD3", "SAC"):
+    for algorithm in ALGORITHMS:
         for name, group in wide.groupby(level=0, sort=False):
             change = group[f"jax-{algorithm}"] - group[algorithm]
             n, mean = len(change), change.mean()
@@ -203,7 +240,7 @@ def equality(runs: pd.DataFrame) -> pd.DataFrame:
 def ablations() -> Iterator[Any]:
     """Levels by class, and of policies that learn nothing."""
     yield classes(rows("ablations-in-jax", "runs.csv"))
-    yield discounts()
+    yield from discounts()
     yield from profiles()
     runs = rows("ablations-in-jax", "runs-20000.csv")
     yield each_run(runs)
@@ -216,6 +253,7 @@ def decay() -> Iterator[Any]:
     """Decays outside the cube, and what goes with them."""
     for name in ("runs.csv", "runs-20000.csv"):
         yield decays(rows("ablations-in-jax", name))
+    yield decays_of_classes(rows("ablations-in-jax", "runs.csv"))
     yield references("Default", "Complexity10")
 
 
