@@ -135,19 +135,29 @@ def grid(runs: pd.DataFrame, kind: str, value: str = "wd_regret") -> pd.DataFram
 
 
 def foresight(runs: pd.DataFrame) -> pd.DataFrame:
-    """What misleads costs more than what is only as loud: mean and range over pairs of runs."""
+    """How much more what misleads costs than what is only as loud, over pairs of runs."""
     kind = runs["class_name"].str.extract(r"(misleading|control)-(\d+)")
     wide = runs.assign(kind=kind[0], c=kind[1].astype(float)).dropna(subset=["kind"])
     wide = wide.pivot(index=["algorithm", "gamma", "c", "run"], columns="kind", values="wd_regret")
     change = wide["misleading"] - wide["control"]
-    return change.groupby(["algorithm", "c", "gamma"], sort=False).agg(["mean", "min", "max"])
+    return spread(change.groupby(["algorithm", "c", "gamma"], sort=False))
 
 
-def noise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Mean and range of N₀ under noise, at one discount."""
+def noise(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """N₀ under noise, at one discount, and what the noise costs over pairs of runs."""
     rows = runs[(runs["gamma"] == NOISY_GAMMA) & runs["class_name"].str.match(NOISY)]
-    levels = rows.groupby(["algorithm", "class_name"], sort=False)["wd_regret"]
-    return levels.agg(["mean", "min", "max"])
+    rows = rows.set_index(["algorithm", "class_name", "run"])["wd_regret"]
+    change = rows - rows.xs("plain", level="class_name").reindex(rows.index.droplevel(1)).to_numpy()
+    at = ["algorithm", "class_name"]
+    return spread(rows.groupby(at, sort=False)), spread(change.groupby(at, sort=False))
+
+
+def spread(groups: Any) -> pd.DataFrame:
+    """Mean and range of each group, and the 95 % interval of Student's t."""
+    table = groups.agg(["mean", "min", "max", "std", "count"])
+    arm = stats.t.ppf(0.975, table["count"] - 1) * table["std"] / np.sqrt(table["count"])
+    ends = {"low": table["mean"] - arm, "high": table["mean"] + arm}
+    return table[["mean", "min", "max"]].assign(**ends)
 
 
 def ranked(runs: pd.DataFrame, criticisms: pd.DataFrame, regions: Iterable[str]) -> pd.DataFrame:
@@ -163,11 +173,11 @@ def associations(joined: pd.DataFrame) -> pd.DataFrame:
     `p` is that of the latter, by permutation of N₀ within the cells.
     """
     rows = {}
-    for name, value in (("ranking", "ranking"), ("overestimation", "bias_share")):
+    for value in ("ranking", "bias_share", "bias"):
         for algorithm, group in joined.dropna(subset=[value]).groupby("algorithm", sort=False):
             cells = group.groupby(["class_name", "gamma"])
             within = cells[[value, "wd_regret"]].rank()
-            rows[name, algorithm] = {
+            rows[value, algorithm] = {
                 "runs": len(group),
                 "over all": stats.spearmanr(group[value], group["wd_regret"]).statistic,
                 "within classes": within.corr().iloc[0, 1],
@@ -244,7 +254,7 @@ def tables() -> Iterator[tuple[str, pd.DataFrame]]:
         for kind in ("misleading", "control"):
             yield f"{algorithm}, {kind}: N₀", grid(own, kind)
     yield "misleading − control", foresight(runs)
-    yield "noise: N₀", noise(runs)
+    yield from zip(("noise: N₀", "noise − none"), noise(runs), strict=True)
     for algorithm, own in cube.groupby("algorithm", sort=False):
         for value in ("ranking", "misled_ranking", "bias_share"):
             if own[value].notna().any():

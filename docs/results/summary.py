@@ -22,6 +22,8 @@ import pandas as pd
 from scipy import stats
 
 from sme_registry import Profile, evaluate, load
+from sme_registry.spec import ProtocolFile, Suite, SuiteFile, catalogue
+from sme_registry.statistics import aggregate, iqm, stratified_bootstrap
 
 RESULTS = Path(__file__).parent
 RUN = ["algorithm", "class_name", "run", "steps", "complexity", "spec_digest", "seed", "uses"]
@@ -36,6 +38,7 @@ OF_LIVES = (
 )
 OF_TRAINING = "learning_transfer", "online_regret"
 ALGORITHMS = "PPO", "TD3", "SAC"
+UNTRAINED = "linear", "constant", "random"
 MARGIN = 0.02  # of N₀, within which two implementations count as equal
 
 
@@ -194,7 +197,7 @@ def references(*names: str) -> pd.DataFrame:
     """N₀, N̄ and the decay, in per cent, of the policies that learn nothing: means of five draws."""
     table: dict[Any, dict[str, float]] = {}
     for name in names:
-        for policy in ("linear", "constant", "random"):
+        for policy in UNTRAINED:
             reports = [
                 evaluate(policy, load(name).derive(seed=seed), "quick-v1") for seed in range(1, 6)
             ]
@@ -206,6 +209,40 @@ def references(*names: str) -> pd.DataFrame:
                 "mean decay": lost.mean(),
                 "decay_5": lost[:, -1].mean(),
             }
+    return pd.DataFrame(table).T.round(2)
+
+
+def of_board(suite: Suite) -> pd.DataFrame:
+    """θ of N₀ and N̄ of each method with its interval, by the rule of a board on this suite."""
+    seed = f"{suite.digest}\n{catalogue.find(ProtocolFile, 'paper-v1').digest}"
+    runs, values = pd.read_csv(RESULTS / "baselines.csv"), ["wd_regret", "ood_regret"]
+    table = {}
+    for method, of_method in runs.groupby("method"):
+        groups = dict(iter(of_method.groupby("spec_digest")[values]))
+        strata = {digest: np.sort(group.to_numpy(), axis=0) for digest, group in groups.items()}
+        weights = {
+            spec.digest: 1.0 / len(member.instances)
+            for member in suite.classes
+            for spec in member.instances
+        }
+        theta = aggregate(strata, iqm, weights)
+        low, high = stratified_bootstrap(strata, 10_000, seed, iqm, weights)
+        ends = np.transpose([theta, low, high]).ravel()
+        table[method] = dict(
+            zip(["N0", "low", "high", "mean N", "low ", "high "], ends, strict=True)
+        )
+    return pd.DataFrame(table).T.round(3)
+
+
+def of_references(suite: Suite) -> pd.DataFrame:
+    """N₀ and N̄ of the policies that learn nothing: means over classes of means over draws."""
+    table = {}
+    for policy in UNTRAINED:
+        of_classes = []
+        for member in suite.classes:
+            reports = [evaluate(policy, task, "quick-v1") for task in member.instances]
+            of_classes.append(np.mean([[r.wd_regret, r.ood_regret] for r in reports], axis=0))
+        table[policy] = dict(zip(["N0", "mean N"], np.mean(of_classes, axis=0), strict=True))
     return pd.DataFrame(table).T.round(2)
 
 
@@ -258,9 +295,12 @@ def decay() -> Iterator[Any]:
 
 
 def agents() -> Iterator[Any]:
-    """Whether the two implementations learn alike."""
+    """Whether the two implementations learn alike, and the baselines by the rule of a board."""
     yield equality(rows("equal-agents", "runs.csv"))
     yield references("Default")
+    suite = catalogue.find(SuiteFile, "smoke").suite
+    yield of_board(suite)
+    yield of_references(suite)
 
 
 def continual() -> Iterator[Any]:

@@ -65,6 +65,7 @@ def part(page, begin, end):
         ("continual", "| | | N at visits", "![Plasticity"),
         ("continual", "| N on the visit's own task", "From visit 2 on"),
         ("agents", "JAX minus SB3 in N₀", "Three runs of TD3"),
+        ("agents", "Stable-Baselines3's agents, ten", "On the plane"),
         ("offline", "## Quality of the data", "## Ours and d3rlpy's"),
         ("limits_and_distractors", "## Which distractors", "![Step reward against cost"),
     ],
