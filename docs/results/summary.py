@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import runpy
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -354,17 +355,20 @@ def offline() -> Iterator[Any]:
 
 
 PAGES = {page.__name__: page for page in (ablations, decay, agents, continual, offline)}
+SCRIPTS = "foresight", "limits_and_distractors"  # pages whose own scripts also make their runs
 
 
 def printed(page: str) -> str:
     """The tables of a page."""
+    if page in SCRIPTS:
+        return str(runpy.run_path(str(RESULTS / f"{page}.py"))["printed"]())
     return "\n\n".join(table.to_string() for table in PAGES[page]())
 
 
 def main() -> None:
     """Print the tables, after writing the rows if a report's table is given."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("page", choices=PAGES)
+    parser.add_argument("page", choices=[*PAGES, *SCRIPTS])
     parser.add_argument("--rows", type=Path)
     parser.add_argument("--from", dest="results", type=Path, nargs="*", default=[])
     options = parser.parse_args()
