@@ -24,7 +24,7 @@ CHECKS = {
     "channel_spread": "spread of π*",
     "linear_policy_reward": "reward of the linear policy",
     "broken_limits": "share of limits that π* breaks",
-    "price_of_safety": "price of safety",
+    "price_of_safety": "price of the projection",
     "mixing_linear_r2": "R² of a linear map that undoes the mixing",
 }
 """The checks that a card shows, and what it calls them; the others ask whether a task is broken."""

@@ -420,7 +420,7 @@ def _safety_table(report: EvaluationReport, safety: SafetyReport) -> Table:
     for field, label in _SAFETY.items():
         rows = [(name, _of(regions, field)) for name, regions in policies]
         table.add_group(label, rows, ".1%" if field == "violating_share" else ".3f")
-    table.add("price of safety", _of(safety.regions, "price_of_safety"))
+    table.add("price of the projection", _of(safety.regions, "price_of_safety"))
     return table
 
 
