@@ -320,7 +320,7 @@ def continual() -> Iterator[Any]:
         for metric in ("normalised_regret", "plasticity_difference", *OF_TRAINING)
     }
     yield by_visit["normalised_regret"].round(2)
-    # Fresh agents: without rows of lives there are three, whose IQM is the mean.
+    # Fresh agents: without rows of lives (SAC) there are three, whose IQM is the mean.
     fresh = by_visit["normalised_regret"] - by_visit["plasticity_difference"]
     lives = pd.read_csv(RESULTS / "continual" / "lives-visits.csv")
     of_lives = lives.groupby([*place, "visit"])["fresh_normalised_regret"]
@@ -328,6 +328,7 @@ def continual() -> Iterator[Any]:
     yield fresh.round(2)
     small = pd.read_csv(RESULTS / "continual" / "buffer.csv").groupby("visit")
     yield small["normalised_regret"].agg(["mean", "min", "max"]).round(2)
+    yield small["forgetting"].mean().round(2)
     for metric in OF_TRAINING:
         yield by_visit[metric].round(2)
     tasks = [phase.spec for phase in load("Switch5").phases]
