@@ -292,7 +292,7 @@ def test_the_table_of_a_team_has_three_lines_for_each_agent():
 
 def test_tables_show_safety_and_distractors():
     safe, text = report_of("safe"), everything(report_of("safe"))
-    for heading in ("cost", "violating share", "safe regret", "price of the proj", "safe projection"):
+    for heading in ("cost", "violating share", "safe regret", "price of", "safe projection"):
         assert heading in text
     assert f"{safe.safety.regions[0].safe_regret:.3f}" in text
     text = everything(report_of("distracted"))
