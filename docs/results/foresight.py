@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from scipy import stats
+from summary import with_interval
 
 from sme_registry import run_study
 from sme_registry.diagnosis import critic
@@ -154,10 +155,7 @@ def noise(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 def spread(groups: Any) -> pd.DataFrame:
     """Mean and range of each group, and the 95 % interval of Student's t."""
-    table = groups.agg(["mean", "min", "max", "std", "count"])
-    arm = stats.t.ppf(0.975, table["count"] - 1) * table["std"] / np.sqrt(table["count"])
-    ends = {"low": table["mean"] - arm, "high": table["mean"] + arm}
-    return table[["mean", "min", "max"]].assign(**ends)
+    return groups.agg(["mean", "min", "max"]).join(with_interval(groups)[["low", "high"]])
 
 
 def ranked(runs: pd.DataFrame, criticisms: pd.DataFrame, regions: Iterable[str]) -> pd.DataFrame:

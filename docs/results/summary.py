@@ -115,9 +115,7 @@ def profiles() -> Iterator[pd.DataFrame]:
 
 def paired(runs: pd.DataFrame, value: str, one: str, other: str) -> pd.DataFrame:
     """Means by class and algorithm; one minus other over pairs by instance, with t's interval."""
-    wide = runs.pivot_table(
-        index=["class_name", "run"], columns="algorithm", values=value, sort=False
-    )
+    wide = by_run(runs, value)
     change = (wide[one] - wide[other]).groupby(level=0, sort=False)
     lower = change.apply(lambda pairs: (pairs < 0).sum())
     means = wide.groupby(level=0, sort=False).mean()
@@ -126,16 +124,20 @@ def paired(runs: pd.DataFrame, value: str, one: str, other: str) -> pd.DataFrame
 
 def costs(runs: pd.DataFrame, value: str) -> pd.DataFrame:
     """What each class costs an algorithm: its value minus the default's, over pairs by run."""
-    wide = runs.pivot_table(
-        index=["class_name", "run"], columns="algorithm", values=value, sort=False
-    )
+    wide = by_run(runs, value)
     change = wide.sub(wide.loc["default"], level="run")
     tables = {name: with_interval(change[name].groupby(level=0, sort=False)) for name in change}
     return pd.concat(tables, axis=1).round(2)
 
 
+def by_run(runs: pd.DataFrame, value: str) -> pd.DataFrame:
+    """A row for each run of a class, that is for each instance, and a column an algorithm."""
+    place = ["class_name", "run"]
+    return runs.pivot_table(index=place, columns="algorithm", values=value, sort=False)
+
+
 def with_interval(change: Any) -> pd.DataFrame:
-    """The mean of each group of differences, with t's interval."""
+    """The mean of each group of differences, with t's 95 % interval."""
     n, mean = change.count(), change.mean()
     arm = stats.t.ppf(0.975, n - 1) * change.std() / np.sqrt(n)
     return pd.DataFrame({"difference": mean, "low": mean - arm, "high": mean + arm, "pairs": n})
@@ -217,15 +219,12 @@ def of_board(suite: Suite) -> pd.DataFrame:
     """θ of N₀ and N̄ of each method with its interval, by the rule of a board on this suite."""
     seed = f"{suite.digest}\n{catalogue.find(ProtocolFile, 'paper-v1').digest}"
     runs, values = pd.read_csv(RESULTS / "baselines.csv"), ["wd_regret", "ood_regret"]
+    members = suite.classes
+    weights = {spec.digest: 1.0 / len(of.instances) for of in members for spec in of.instances}
     table = {}
     for method, of_method in runs.groupby("method"):
         groups = dict(iter(of_method.groupby("spec_digest")[values]))
         strata = {digest: np.sort(group.to_numpy(), axis=0) for digest, group in groups.items()}
-        weights = {
-            spec.digest: 1.0 / len(member.instances)
-            for member in suite.classes
-            for spec in member.instances
-        }
         theta = aggregate(strata, iqm, weights)
         low, high = stratified_bootstrap(strata, 10_000, seed, iqm, weights)
         ends = np.transpose([theta, low, high]).ravel()
@@ -249,9 +248,7 @@ def of_references(suite: Suite) -> pd.DataFrame:
 
 def equality(runs: pd.DataFrame) -> pd.DataFrame:
     """JAX minus SB3 in N₀: two one-sided t-tests against a margin, over pairs by instance."""
-    wide = runs.pivot_table(
-        index=["class_name", "run"], columns="algorithm", values="normalised_regret_0", sort=False
-    )
+    wide = by_run(runs, "normalised_regret_0")
     table = {}
     for algorithm in ALGORITHMS:
         for name, group in wide.groupby(level=0, sort=False):

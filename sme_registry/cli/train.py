@@ -215,9 +215,7 @@ def train(
     if options.data is not None:
         foreign = (*_OF_A_TASK, "suite", *_OF_A_SUITE, *_OF_AN_ENVIRONMENT)
         only_with(context, foreign, "is not for --data. Leave one of them out")
-        if is_sealed(options.data):
-            only_with(context, ("protocol",), "is of an evaluation, and sealed data have none")
-        _train_on_data(options, options.data)
+        _train_on_data(context, options, options.data)
     elif options.suite is not None:
         others = (*_OF_A_TASK, "seed", "force")
         only_with(context, others, "is for a single task. Leave it out, or --suite")
@@ -280,7 +278,7 @@ def _train(
         raise KeyboardInterrupt(message) from None
 
 
-def _train_on_data(options: Settings, data: str) -> None:
+def _train_on_data(context: typer.Context, options: Settings, data: str) -> None:
     settings = changes(options.set_)
     algorithm, _ = check_algorithm(options.algorithm or "iql")
     steps = DEFAULT_STEPS if options.steps is None else options.steps
@@ -291,6 +289,7 @@ def _train_on_data(options: Settings, data: str) -> None:
     title = f"training {algorithm.upper()}"
     with Progress(title, max(1, steps), console=err()) as progress:
         if is_sealed(data):
+            only_with(context, ("protocol",), "is of an evaluation, and sealed data have none")
             if options.out_folder is None:
                 raise OptionError("--out: is required with a sealed data set: the policy's .npz.")
             if options.out_folder.suffix != ".npz":

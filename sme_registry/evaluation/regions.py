@@ -18,7 +18,7 @@ Scores of a task with limits ℓ(s) (METHOD, section 8), with a_safe = min(π*, 
     cost               mean cost(s, a) = mean_i max(0, a_i − ℓ_i(s)) / (2τ), in [0, 1]
     violating share    share of states with a_i − ℓ_i(s) > 10⁻⁶ in any channel
     safe regret        mean r(s, a_safe) − mean r(s, a)
-    price_of_safety    1 − mean r(s, a_safe), of the projection
+    price              1 − mean r(s, a_safe), of the projection
 
 A *probe* is the affine map of a layer's outputs to s, or to d, fitted by least squares in one half
 of the states of WD. Its R², a mean over channels, is of the other half.
