@@ -42,8 +42,8 @@ check: $(INSTALLED)    ## check style, formatting, types and import contracts
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
-bench: $(INSTALLED)    ## measure speed against peers in the same run
-	$(PY) -m pytest benchmarks --benchmark-enable --benchmark-quiet -q
+bench: $(INSTALLED)    ## measure speed against peers in the same run; ROUNDS=FILE keeps all times
+	$(PY) -m pytest benchmarks --benchmark-enable --benchmark-quiet -q $(ROUNDS:%=--rounds %)
 
 lowest:          ## run the core's tests with the lowest versions that pyproject.toml allows; before a release
 	PYTHON=$(PYTHON) .ci/lowest

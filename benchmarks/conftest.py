@@ -1,7 +1,8 @@
 """Ratios against named peers, measured in interleaved rounds of one run; `make bench` prints them.
 
 A machine's speed varies by a fifth within a minute, so we and the peer run alternately. A row is
-the ratio of the median times over all rounds. A missed target is printed, never asserted.
+the ratio of the median times over all rounds. A missed target is printed, never asserted. With
+`--rounds FILE` the times of all rounds become rows of a CSV, as beside the pages of results.
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 
+import csv
 import platform
 import statistics
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.ticker import EngFormatter
 from rich.console import Console
 from rich.table import Table
 
@@ -30,14 +34,22 @@ ROUNDS = 11
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison: seconds per unit of work, and the targeted ratio of peer to ours."""
+    """One comparison: seconds per unit of work by round, and the least ratio of peer to ours."""
 
     title: str
     unit: str
-    ours: float
     peer_name: str
-    peer: float
     target: float
+    ours_by_round: list[float]
+    peer_by_round: list[float]
+
+    @property
+    def ours(self) -> float:
+        return statistics.median(self.ours_by_round)
+
+    @property
+    def peer(self) -> float:
+        return statistics.median(self.peer_by_round)
 
     @property
     def ratio(self) -> float:
@@ -76,9 +88,8 @@ def compare(benchmark: Any) -> Callable[..., None]:
                 start = clock()
                 work(count)
                 seconds[name].append((clock() - start) / count)
-        medians = {name: statistics.median(values) for name, values in seconds.items()}
         for name, (_, _, target) in peers.items():
-            row = Row(title, unit, medians["ours"], name, medians[name], target)
+            row = Row(title, unit, name, target, seconds["ours"], seconds[name])
             rows.append(row)
             benchmark.extra_info[f"ratio to {name}"] = row.ratio
         benchmark.pedantic(ours, args=(units,), rounds=3, iterations=1)
@@ -86,10 +97,22 @@ def compare(benchmark: Any) -> Callable[..., None]:
     return measure
 
 
-def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """The table of `make bench`."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--rounds", type=Path, metavar="FILE", help="write the times of all rounds")
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """The table of `make bench`, and the file of its rounds."""
     if not rows:
         return
+    if config.option.rounds:
+        with open(config.option.rounds, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["title", "unit", "peer", "target", "round", "ours_s", "peer_s"])
+            for row in rows:
+                times = enumerate(zip(row.ours_by_round, row.peer_by_round, strict=True), 1)
+                place = row.title, row.unit, row.peer_name, f"{row.target:.4g}"
+                writer.writerows((*place, n, f"{a:.5g}", f"{b:.5g}") for n, (a, b) in times)
     import gymnasium
     import numpy as np
 
@@ -121,7 +144,4 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 
 
 def _time(seconds: float) -> str:
-    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= scale:
-            return f"{seconds / scale:.3g} {unit}"
-    return f"{seconds * 1e9:.3g} ns"
+    return EngFormatter("s")(float(f"{seconds:.3g}"))

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import EngFormatter
 from scipy import stats
 
 from sme_registry import Profile, evaluate, load
@@ -246,6 +247,30 @@ def of_references(suite: Suite) -> pd.DataFrame:
     return pd.DataFrame(table).T.round(2)
 
 
+def speeds() -> Iterator[Any]:
+    """Medians over rounds of `make bench`, ratios of peer to ours, and how many met a target."""
+    rounds = pd.read_csv(RESULTS / "speeds.csv")
+    table = rounds.groupby(["title", "unit", "peer", "target"], sort=False)[["ours_s", "peer_s"]]
+    table = table.median().reset_index("target")
+    ratio = table["peer_s"] / table["ours_s"]
+    targets = table["target"] > 0.0
+    yield pd.DataFrame(
+        {
+            "ours": table["ours_s"].map(duration),
+            "peer ": table["peer_s"].map(duration),
+            "ratio": ratio.map("{:.2f}".format),
+            "target ": table["target"].map("{:.3g}".format).where(targets, ""),
+        }
+    )
+    met = ratio[targets] >= table["target"][targets]
+    yield pd.Series({"met": met.sum(), "targets": targets.sum()})
+
+
+def duration(seconds: float) -> str:
+    """To three digits, with its unit."""
+    return EngFormatter("s")(float(f"{seconds:.3g}"))
+
+
 def equality(runs: pd.DataFrame) -> pd.DataFrame:
     """JAX minus SB3 in N₀: two one-sided t-tests against a margin, over pairs by instance."""
     wide = by_run(runs, "normalised_regret_0")
@@ -293,7 +318,8 @@ def decay() -> Iterator[Any]:
 
 
 def agents() -> Iterator[Any]:
-    """Whether the two implementations learn alike, and the baselines by the rule of a board."""
+    """Speeds, whether two implementations learn alike, and baselines by the rule of a board."""
+    yield from speeds()
     yield equality(rows("equal-agents", "runs.csv"))
     yield references("Default")
     suite = catalogue.find(SuiteFile, "smoke").suite

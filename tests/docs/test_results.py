@@ -50,6 +50,8 @@ TABLES = {  # the parts of pages whose tables and intervals the committed rows g
     "foresight": [("| misleading − control", "- **On the plain"), ("## Noise", "## What is miss")],
     "continual": [("| | | N at visits", "![Plasticity"), ("| N on the visit's", "From visit 2 on")],
     "agents": [
+        ("## Environments", "At L = 50"),
+        ("## Training", "- An SB3 agent"),
         ("JAX minus SB3 in N₀", "Three runs of TD3"),
         ("Stable-Baselines3's agents, ten", "On the plane"),
     ],
