@@ -107,7 +107,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
         return
     if config.option.rounds:
         with open(config.option.rounds, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
+            writer = csv.writer(file, lineterminator="\n")
             writer.writerow(["title", "unit", "peer", "target", "round", "ours_s", "peer_s"])
             for row in rows:
                 times = enumerate(zip(row.ours_by_round, row.peer_by_round, strict=True), 1)

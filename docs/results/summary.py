@@ -105,13 +105,17 @@ def profiles() -> Iterator[pd.DataFrame]:
         if len(profile.values(row.class_name)) == profile.seeds
     ]
     clones = pd.read_csv(RESULTS / "ablations-in-jax" / "clones.csv")
+    fits = by_run(clones, "wd_regret", ["algorithm", "states_of"])
     clones["algorithm"] = "clone, " + clones["algorithm"]
-    table = pd.concat([pd.DataFrame(runs), clones])
+    table = pd.concat([pd.DataFrame(runs), clones[clones["states_of"] == "uniform"]])
     yield paired(table, "wd_regret", "TD3", "PPO")
     yield costs(table[table["algorithm"].isin(["PPO", "PPO (gamma 0)"])], "wd_regret")
     for one, other in (("SAC", "PPO"), *((f"{name} (gamma 0)", name) for name in ALGORITHMS)):
         pairs = paired(table, "wd_regret", one, other)
         yield pairs[["difference", "low", "high", "pairs", "lower"]].dropna().add_prefix(f"{one}: ")
+    change = fits.xs("PPO", axis=1, level=1) - fits.xs("uniform", axis=1, level=1)
+    largest = change.abs().groupby(level=0).max().dropna().round(3)
+    yield largest.add_prefix("in PPO's states, clone, ")
 
 
 def paired(runs: pd.DataFrame, value: str, one: str, other: str) -> pd.DataFrame:
@@ -131,10 +135,10 @@ def costs(runs: pd.DataFrame, value: str) -> pd.DataFrame:
     return pd.concat(tables, axis=1).round(2)
 
 
-def by_run(runs: pd.DataFrame, value: str) -> pd.DataFrame:
+def by_run(runs: pd.DataFrame, value: str, columns: Any = "algorithm") -> pd.DataFrame:
     """A row for each run of a class, that is for each instance, and a column an algorithm."""
     place = ["class_name", "run"]
-    return runs.pivot_table(index=place, columns="algorithm", values=value, sort=False)
+    return runs.pivot_table(index=place, columns=columns, values=value, sort=False)
 
 
 def with_interval(change: Any) -> pd.DataFrame:

@@ -338,13 +338,19 @@ def exploration_sd(
     return tuple(np.sqrt(sampled.var(axis=0, ddof=1).mean(axis=0)).tolist())
 
 
-def probe_capacity(network: Perceptron, task: Task, states: int, seed: int) -> CapacityProbe:
+def probe_capacity(
+    network: Perceptron, task: Task, states: int, seed: int, visited: Array | None = None
+) -> CapacityProbe:
+    """Fit to a* in so many states: uniform ones, or those `[N, S]` that an agent has visited."""
     require_packages("probe_capacity", {"torch": "PyTorch"}, "train")
     import torch
 
     begun = time.monotonic()
     count = max(_MIN_STATES, min(states, _MAX_STATES))
-    observation, exact = observed(task, states_of(task.spec, count + _TEST_STATES, seed))
+    drawn = states_of(task.spec, count + _TEST_STATES, seed)
+    if visited is not None:
+        drawn.s[:count] = visited[:count]
+    observation, exact = observed(task, drawn)
     optimal = exact.astype(np.float32)
     constant_mae = float(np.abs(0.5 - optimal[count:]).mean())
     with _torch_seed(seed):

@@ -415,13 +415,13 @@ def test_the_probe_fits_what_a_network_can_represent_and_fails_at_the_rest(monke
     torch = pytest.importorskip("torch")
     from sme_registry.evaluation.networks import Perceptron
 
-    def probe(widths, spec, states):
+    def probe(widths, spec, states, visited=None):
         *inner, last = [
             (np.zeros(pair, np.float32), np.zeros(pair[1], np.float32), "tanh")
             for pair in itertools.pairwise(widths)
         ]
         network = Perceptron((*inner, (*last[:2], "identity")))
-        return behaviour.probe_capacity(network, materialize(spec), states, 0)
+        return behaviour.probe_capacity(network, materialize(spec), states, 0, visited)
 
     monkeypatch.setattr(behaviour, "GRADIENT_STEPS", 300)
     monkeypatch.setattr(behaviour, "_MIN_STATES", 16)
@@ -430,6 +430,8 @@ def test_the_probe_fits_what_a_network_can_represent_and_fails_at_the_rest(monke
     wide = probe((10, 64, 4), SPEC, 5000)
     narrow = probe((10, 1, 4), SPEC, 5000)
     few = probe((10, 64, 64, 4), DEEP, 1)
+    of_one_state = probe((10, 64, 4), SPEC, 5000, np.full((5000, 8), 0.1))
+    assert of_one_state.train_normalised_regret < 0.1 < 0.6 < of_one_state.test_normalised_regret
     assert wide.layers == (10, 64, 4)
     assert wide.test_normalised_regret < 0.2 < 0.6 < narrow.train_normalised_regret
     assert few.states == 16

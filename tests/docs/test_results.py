@@ -45,7 +45,7 @@ def test_the_parts_of_a_reference_profile_are_joined_to_the_whole(script):
 
 
 TABLES = {  # the parts of pages whose tables and intervals the committed rows give
-    "ablations": [("## PPO, ten runs", "- **What is missing")],
+    "ablations": [("## PPO, ten runs", "- **Missing")],
     "decay": [("| 100,000 steps", "The paper reports"), ("| | cosine", "It is no evidence")],
     "foresight": [("| misleading − control", "- **On the plain"), ("## Noise", "## What is miss")],
     "continual": [("| | | N at visits", "![Plasticity"), ("| N on the visit's", "From visit 2 on")],
