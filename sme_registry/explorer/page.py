@@ -69,7 +69,7 @@ def write_explorer(
     """Write the page of a task, or of a policy on its task, completely or not at all.
 
     `channels` are pairs of inputs, from 1 (state channels, then distractors), over which a policy
-    whose network is unknown is sampled.
+    whose network is unknown is sampled; an OptionError where there is no such policy.
     """
     if Path(path).suffix != ".html":
         raise OptionError(f"{os.fspath(path)}: must end in .html.")
@@ -167,6 +167,10 @@ def facts(
     if run is not None:
         name = _name(run)
         policies.insert(0, {"name": name, **_policy(run, task, pairs or [(0, 1)])})
+    if pairs and policies[0]["of"] != "grid":
+        raise OptionError(
+            "--channels: are of a policy whose network is unknown; this map shows any two channels."
+        )
     probes = () if report is None or report.observation is None else report.observation.probes
     return {
         "title": catalogue.title(spec),
@@ -266,10 +270,12 @@ def _policy(subject: Subject, task: Task, pairs: Sequence[tuple[int, int]]) -> d
 
 def _grid(policy: Policy | TeamPolicy, task: Task, axes: tuple[int, int]) -> dict[str, Any]:
     """Actions `[_GRID, _GRID, A]` over two inputs; rows by the second."""
-    side = np.linspace(-_EPSILON / 2.0, 1.0 + _EPSILON / 2.0, _GRID)
     points = np.tile(resting(task.spec), (_GRID * _GRID, 1))
-    points[:, axes[0]] = np.tile(side, _GRID)
-    points[:, axes[1]] = np.repeat(side, _GRID)
+    time = points.shape[1] - 2  # which does not leave the unit range
+    beyond = [_EPSILON / 2.0 if axis < time else 0.0 for axis in axes]
+    across, up = (np.linspace(-more, 1.0 + more, _GRID) for more in beyond)
+    points[:, axes[0]] = np.tile(across, _GRID)
+    points[:, axes[1]] = np.repeat(up, _GRID)
     seen = programs.observe(task)(points).astype(np.float32)
     rows = [np.clip(policy(part), 0.0, 1.0) for part in np.array_split(seen, _GRID)]
     actions = np.concatenate(rows).astype(np.float32)

@@ -209,6 +209,14 @@ def test_a_task_of_one_channel_has_a_map_over_time(tmp_path, opened):
     shown, _ = map_of(opened(written(tmp_path, spec, offline(spec))))
     assert (shown["axes"], shown["low"]) == ([0, 1], [-0.5, 0])
 
+    def act(o):
+        return np.abs(np.sin(3.0 * o[:, :1] + 5.0 * o[:, 1:2]))
+
+    page = opened(written(tmp_path, spec, act))
+    shown, points = choose(page, "Show", "regret")
+    regret = materialize(spec).regret(points[:, :1], act(observations(spec, points)))
+    np.testing.assert_allclose(shown["values"], regret, atol=TOLERANCE)
+
 
 @pytest.mark.filterwarnings("ignore:.*actions below 0 are clipped")
 def test_no_page_is_wider_than_the_screen(tmp_path, opened):

@@ -68,6 +68,8 @@ def test_a_task_and_a_policy_become_pages(here):
         (["."], "contains no run.json"),
         (["Switch5"], "is a stream"),
         (["actor.npz", "-t", "small.json", "--channels", "1"], "must be two channels"),
+        (["actor.npz", "-t", "small.json", "--channels", "1,2"], "whose network is unknown"),
+        (["small.json", "--channels", "1,2"], "whose network is unknown"),
         (["actor.npz", "-t", "small.json", "--channels", "1,4"], "different channels in [1, 3]"),
         (
             ["small.json", "--set", "complexity=3", "--set", "hidden_width=1500"],

@@ -232,9 +232,9 @@ function drawMarks() {
 // The map's number of the nearest grid point; of a sampled policy, which is known only there.
 function sampledAt(grid, points, rows) {
   const actions = new Float64Array(rows * A);
-  const index = (value) => Math.min(Math.max(Math.round(((value + grid.epsilon / 2) / (1 + grid.epsilon)) * (grid.n - 1)), 0), grid.n - 1);
+  const index = (value, epsilon) => Math.min(Math.max(Math.round(((value + epsilon / 2) / (1 + epsilon)) * (grid.n - 1)), 0), grid.n - 1);
   for (let row = 0; row < rows; row++) {
-    const [column, line] = grid.axes.map((axis) => index(points[row * inputs.length + axis]));
+    const [column, line] = grid.axes.map((axis) => index(points[row * inputs.length + axis], inputs[axis].unit ? 0 : grid.epsilon));
     const from = (line * grid.n + column) * A;
     actions.set(grid.actions.subarray(from, from + A), row * A);
   }
