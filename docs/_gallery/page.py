@@ -39,11 +39,6 @@ _GROUPS = {  # in the reference's order; an entry is in the last of which it has
     "continual": Group("streams", "Streams"),
 }
 _FIELDS = {"k": 1, "r_min": 0, "D": 0}  # shown where they differ from this
-_METRICS = {
-    "visited_regret": "N at the end of visits",
-    "forgetting": "forgetting",
-    "plasticity_ratio": "plasticity ratio",
-}
 _JOINT, _FIXED = "\u2060", "\u00a0"  # narrow lines do not break at a dash, a × or a =
 READING = """\
 - **The pictures** show two action channels of π* over two state channels from −½ to 1½, with all
@@ -165,8 +160,8 @@ def _stream_tables(known: dict[str, Any], lives: list[results.Life]) -> list[str
         counts = ", ".join(str(life.lives) for life in lives)
         link = f"[{counts} lives]({_page(results.STREAM_PAGE)}), IQM"
         rows = [
-            (label, *(_value(life.metrics[name][0]) for life in lives))
-            for name, label in _METRICS.items()
+            (label, *(_value(life.metrics[name]) for life in lives))
+            for name, label in results.METRICS.items()
         ]
         tables.append(_table((link, *(life.algorithm for life in lives)), rows))
     return tables

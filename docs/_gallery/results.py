@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sme_registry.spec import Setting, SMESpec, StudyFile, SuiteClass, SuiteFile, catalogue
+from sme_registry.statistics import iqm
 
 RESULTS = Path(__file__).parents[1] / "results"
 ALGORITHMS = ("PPO", "TD3", "SAC")
@@ -44,11 +45,11 @@ class Level(NamedTuple):
 
 
 class Life(NamedTuple):
-    """Metrics of an algorithm's lives in a stream: IQM and the ends of its interval."""
+    """The IQMs, over an algorithm's lives in a stream, of metrics in the cube."""
 
     algorithm: str
     lives: int
-    metrics: dict[str, tuple[float, float, float]]
+    metrics: dict[str, float]
 
 
 _BY_REGION = tuple(f"normalised_regret_{m}" for m in range(6))
@@ -69,7 +70,12 @@ STUDIES = (
         for name in ("representation", "safety")
     ),
 )
-STREAMS, STREAM_PAGE = "continual/metrics.csv", "continual.md"
+LIVES, STREAM_PAGE = "continual/lives.csv", "continual.md"
+METRICS = {  # of lives, by the columns of their table
+    "visited_regret": "N at the end of visits",
+    "forgetting": "forgetting",
+    "plasticity_ratio": "plasticity ratio",
+}
 
 
 def setting_of(spec: SMESpec) -> str:
@@ -92,16 +98,14 @@ def levels() -> dict[str, list[Level]]:
 
 def lives() -> dict[str, list[Life]]:
     """What is known of each stream of the catalogue, by its name without the version."""
-    found: dict[tuple[str, str], Life] = {}
-    for row in _table(STREAMS):
-        if row["region"] == "WD" and row["algorithm"] in ALGORITHMS:
-            key = row["class_name"], row["algorithm"]
-            life = found.setdefault(key, Life(row["algorithm"], int(row["runs"]), {}))
-            low, high = float(row["low"]), float(row["high"])
-            life.metrics[row["metric"]] = float(row["iqm"]), low, high
+    rows: dict[tuple[str, str], list[dict[str, str]]] = defaultdict(list)
+    for row in _table(LIVES):
+        if row["region"] == "WD":
+            rows[row["class_name"], row["algorithm"]].append(row)
     streams: dict[str, list[Life]] = defaultdict(list)
-    for (stream, _), life in found.items():
-        streams[stream].append(life)
+    for (stream, algorithm), of_method in rows.items():
+        values = {name: float(iqm([float(row[name]) for row in of_method])) for name in METRICS}
+        streams[stream].append(Life(algorithm, len(of_method), values))
     return streams
 
 

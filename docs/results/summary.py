@@ -53,11 +53,14 @@ def compact(results: pd.DataFrame) -> pd.DataFrame:
     return kept.join(wide).reset_index().round(6)
 
 
-def in_cube(lives: pd.DataFrame) -> pd.DataFrame:
-    """One row a life, or a visit of one, with the columns that are beside the page."""
-    beside = RESULTS / "continual" / ("lives-visits.csv" if "visit" in lives else "lives.csv")
-    columns = pd.read_csv(beside, nrows=0).columns
-    return lives.loc[lives["region"] == "WD", columns].round(6)
+def of_lives(lives: pd.DataFrame) -> pd.DataFrame:
+    """One row a life in the cube and over the shells, or a row in the cube for each of its visits.
+
+    With the columns of the file beside the page.
+    """
+    name, regions = ("lives-visits", ["WD"]) if "visit" in lives else ("lives", ["WD", "OOD"])
+    columns = pd.read_csv(RESULTS / "continual" / f"{name}.csv", nrows=0).columns
+    return lives.loc[lives["region"].isin(regions), columns].round(6)
 
 
 def rows(*path: str) -> pd.DataFrame:
@@ -133,6 +136,12 @@ def costs(runs: pd.DataFrame, value: str) -> pd.DataFrame:
     change = wide.sub(wide.loc["default"], level="run")
     tables = {name: with_interval(change[name].groupby(level=0, sort=False)) for name in change}
     return pd.concat(tables, axis=1).round(2)
+
+
+def with_bootstrap(runs: pd.DataFrame, *place: str) -> dict[str, float]:
+    """The IQM of one column `[n, 1]` over runs with its interval, whose draws follow the place."""
+    low, high = stratified_bootstrap({"": runs.to_numpy()}, 10_000, " ".join(place), iqm)
+    return {"iqm": float(iqm(runs)[0]), "low": float(low[0]), "high": float(high[0])}
 
 
 def by_run(runs: pd.DataFrame, value: str, columns: Any = "algorithm") -> pd.DataFrame:
@@ -332,32 +341,23 @@ def agents() -> Iterator[Any]:
 
 
 def continual() -> Iterator[Any]:
-    """Metrics of lives in the cube, and by visit N at its end, of lives and fresh agents."""
-    metrics = pd.read_csv(RESULTS / "continual" / "metrics.csv")
-    metrics = metrics[(metrics["region"] == "WD") & metrics["metric"].isin(OF_LIVES)]
-    table = metrics.set_index(["class_name", "algorithm", "metric"])[["iqm", "low", "high"]]
-    yield table.round(2)
-    visits = pd.read_csv(RESULTS / "continual" / "visits.csv")
-    visits = visits[visits["region"] == "WD"].set_index("metric")
-    place = ["class_name", "algorithm"]
-    by_visit = {
-        metric: visits.loc[metric].pivot_table(
-            index=place, columns="visit", values="iqm", sort=False
-        )
-        for metric in ("normalised_regret", "plasticity_difference", *OF_TRAINING)
-    }
-    yield by_visit["normalised_regret"].round(2)
-    # Fresh agents: without rows of lives (SAC) there are three, whose IQM is the mean.
-    fresh = by_visit["normalised_regret"] - by_visit["plasticity_difference"]
-    lives = pd.read_csv(RESULTS / "continual" / "lives-visits.csv")
-    of_lives = lives.groupby([*place, "visit"])["fresh_normalised_regret"]
-    fresh.update(of_lives.agg(lambda runs: stats.trim_mean(runs, 0.25)).unstack())
-    yield fresh.round(2)
+    """IQMs of lives with intervals, in the cube and outside; of visits; and of fresh agents."""
+    lives = pd.read_csv(RESULTS / "continual" / "lives.csv")
+    place = ["region", "class_name", "algorithm"]
+    yield pd.DataFrame(
+        {
+            (*at, metric): with_bootstrap(of_method[[metric]], metric, *at)
+            for at, of_method in lives.groupby(place, sort=False)
+            for metric in OF_LIVES
+        }
+    ).T.round(2)
+    visits = pd.read_csv(RESULTS / "continual" / "lives-visits.csv")
+    for metric in ("normalised_regret", "fresh_normalised_regret", *OF_TRAINING):
+        of_visits = visits.groupby([*place[1:], "visit"], sort=False)[metric]
+        yield of_visits.agg(lambda runs: float(iqm(runs))).unstack().round(2)
     small = pd.read_csv(RESULTS / "continual" / "buffer.csv").groupby("visit")
     yield small["normalised_regret"].agg(["mean", "min", "max"]).round(2)
     yield small["forgetting"].mean().round(2)
-    for metric in OF_TRAINING:
-        yield by_visit[metric].round(2)
     tasks = [phase.spec for phase in load("Switch5").phases]
     names = "linear", "random"
     untrained = [[evaluate(name, task, "quick-v1").wd_regret for name in names] for task in tasks]
@@ -402,7 +402,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.results:
         frames = pd.concat(pd.read_csv(path) for path in options.results)
-        made = in_cube(frames) if options.page == "continual" else compact(frames)
+        made = of_lives(frames) if options.page == "continual" else compact(frames)
         made.to_csv(options.rows, index=False)
     print(printed(options.page))
 
