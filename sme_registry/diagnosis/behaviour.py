@@ -393,12 +393,19 @@ def _module(network: Perceptron) -> Any:
     """A new network of the same layers, whose outputs are actions in the unit range."""
     from torch import nn
 
-    activations: dict[str, type[nn.Module]] = {"tanh": nn.Tanh}
+    activations: dict[str, type[nn.Module]] = {
+        "identity": nn.Identity,
+        "relu": nn.ReLU,
+        "tanh": nn.Tanh,
+        "sigmoid": nn.Sigmoid,
+        "silu": nn.SiLU,
+        "elu": nn.ELU,
+    }
     modules: list[nn.Module] = []
     for index, (W, _, activation) in enumerate(network.layers):
         modules.append(nn.Linear(*W.shape))
-        if activation != "identity" and index < len(network.layers) - 1:
-            modules.append(activations.get(activation, nn.ReLU)())
+        if network.low is None or index < len(network.layers) - 1:
+            modules.append(activations[activation]())
     if network.low is not None:  # squashed by tanh and scaled to the range: a sigmoid of 2 x
         modules.append(nn.Sigmoid())
     return nn.Sequential(*modules)

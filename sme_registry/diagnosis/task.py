@@ -43,7 +43,7 @@ from sme_registry.diagnosis.questions import (
 from sme_registry.diagnosis.subject import Subject, perceptron_of
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
-from sme_registry.errors import UnknownNameError
+from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation import Policy, evaluate
 from sme_registry.evaluation.policies import TeamPolicy
 from sme_registry.io import choice
@@ -128,13 +128,17 @@ def _limits_and_distractors(
     return fields
 
 
-def _probe(subject: Subject, seed: int) -> CapacityProbe | None:
+def _probe(subject: Subject, seed: int) -> CapacityProbe:
     assert isinstance(subject.policy, Policy)  # of a single agent
     network = perceptron_of(subject.policy)
-    steps = subject.plan.get("steps")
+    if network is None:
+        raise OptionError(
+            f"probe_capacity: fits a network of the same layers, and those of {subject.name!r} are "
+            "unknown. Leave it out."
+        )
+    steps = subject.checkpoint_step or subject.plan.get("steps")
     count = steps if isinstance(steps, int) and steps else behaviour.DEFAULT_STATES
-    task = materialize(subject.spec)
-    return None if network is None else behaviour.probe_capacity(network, task, count, seed)
+    return behaviour.probe_capacity(network, materialize(subject.spec), count, seed)
 
 
 def _compare(run: TaskDiagnosis, other: TaskDiagnosis) -> Comparison:

@@ -76,7 +76,7 @@ def play(
 class Rollouts(NamedTuple):
     """Completed episodes; each array is `[n]`. The numbers of a team are means over its agents."""
 
-    episode_return: Array  # sum of an episode's rewards, in [0, T]
+    episode_return: Array  # sum of an episode's rewards; in [0, T] where no more is paid
     discounted_return: Array  # sum of γ^i times the i-th reward
     length: Array  # number of steps, in [1, T]
     regret: Array  # mean of 1 − step reward over its steps, in [0, 1]

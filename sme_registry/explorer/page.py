@@ -296,9 +296,12 @@ def _episode(
     n = max(1, min(episodes, MAX_NUMBERS // (T * (S + A + 8))))
     starts = draw.uniform(seed, "explorer/starts", n * S).reshape(n, S)
 
+    sizes = [channels.stop - channels.start for channels in task.owned]
+
     def over_time(act: Callable[[Any, Any], Any]) -> dict[str, Any]:
         runs = rollout(act, task, starts, seed)
-        regret = 1.0 - np.mean([run.reward for run in runs], axis=0)
+        mae = np.average([run.mae for run in runs], axis=0, weights=sizes)
+        regret = 1.0 - task.reward_of(1.0 - mae)
         return _over_time(regret, runs[0].alive, T)
 
     half = np.full((n, A), 0.5)

@@ -169,8 +169,9 @@ def field_values(setting: Setting) -> dict[str, Any]:
 
 
 def changed_fields(setting: Setting, default: Setting | None = None) -> dict[str, Any]:
-    others = field_values(default or SMESpec())
-    return {k: v for k, v in field_values(setting).items() if v != others.get(k)}
+    """What differs from another setting; None for what only the other has."""
+    mine, others = field_values(setting), field_values(default or SMESpec())
+    return {k: mine.get(k) for k in {**mine, **others} if mine.get(k) != others.get(k)}
 
 
 def observation_text(document: SMESpec | StreamSpec) -> str:

@@ -45,9 +45,10 @@ _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
 class LearningCurve(StrictModel):
     """Evaluations during training, evenly spaced; all lists have the same length.
 
-    `steps` are gradient steps of an offline learner. `episode_return` is in [0, T], `length` in
-    steps; `regret`, the mean of 1 − step reward, and `similarity` are means over all steps of the
-    episodes, in [0, 1]. `agents_regret` is of each agent of a team.
+    `steps` are gradient steps of an offline learner. `episode_return` is in [0, T], but for what is
+    paid on top (shaping, noise, the price of a state); `length` in steps. `regret`, the mean of
+    1 − step reward, and `similarity` are means over all steps of the episodes, in [0, 1].
+    `agents_regret` is of each agent of a team.
     """
 
     steps: Annotated[tuple[Integer, ...], Field(strict=False)] = ()

@@ -145,7 +145,8 @@ function rangeOf(values) {
     return [-end, end];
   }
   const first = Math.floor(least / 0.05 + 1e-9), last = Math.ceil(most / 0.05 - 1e-9);
-  return [Math.min(first, last - 1) * 0.05, last * 0.05];
+  const top = Math.max(last, Math.round(range[0] / 0.05) + 1); // a map of the least value is not its most
+  return [Math.min(first, top - 1) * 0.05, top * 0.05];
 }
 
 function colours(signed) {

@@ -221,7 +221,7 @@ def _setting(member: SuiteClass) -> dict[str, Any]:
             setting[name] = value
             continue
         fields = fields_of_block(name).items()
-        numbers = (n for n, field in fields if number_type(field) and field.default is not None)
+        numbers = (n for n, f in fields if number_type(f) and (f.is_required() or f.default == 0))
         values = dict.fromkeys(numbers, 0) if value is None else value
         setting |= {f"{name}.{inner}": part for inner, part in values.items()}
     return setting

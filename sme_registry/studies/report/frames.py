@@ -20,7 +20,8 @@ Columns of the run, repeated in each of its regions; NaN or NA where the run has
 
     wd_regret, ood_regret        normalised regret in WD, and its mean over the shells
     ood_decay                    the mean of similarity_decay over the shells
-    final_return                 mean return of the last evaluations, in % of the optimum's
+    final_return                 mean return of the last evaluations, in % of the optimum's; the sum
+                                 of step rewards where more is paid (shaping, noise, a price)
     online_regret                mean of 1 − step reward over training, in [0, 1]
     uses, action_range, steps    the algorithm, its action range, its training steps
     state_dim, action_dim, k, r_min, D, complexity, horizon, hidden_width, policy_init, rotation,
@@ -44,7 +45,8 @@ region, wd_regret, ood_regret and online_regret of the run, and in `curves` regr
 `curves`: one row per run and evaluation during training, ordered by class, algorithm, run, step.
 
     step                         training steps before the evaluation (offline: gradient steps)
-    episode_return               mean return of its episodes, in [0, horizon]
+    episode_return               mean return of its episodes, in [0, horizon] but for what is paid
+                                 on top: shaping, noise and the price of the state
     regret                       mean of 1 − step reward over their steps, in [0, 1]
     similarity                   mean r̃ over their steps, in [0, 1]
     length                       mean length of the episodes, in steps
@@ -95,17 +97,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
 from sme_registry.evaluation import EvaluationReport, StreamReport, retention
 from sme_registry.evaluation.regions import RegionReport
 from sme_registry.evaluation.retention import BY_VISIT, StreamRegion
-from sme_registry.spec import Setting, StudyPlan
+from sme_registry.spec import Setting, SMESpec, StreamSpec, StudyPlan
 from sme_registry.spec.cards import BLOCKS, fields_of_block, number_type
 from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.design import metrics_of
 from sme_registry.studies.result import CellResult, report_of_life
+from sme_registry.task.draw import Array
 
 RUN = ["class_name", "algorithm", "run"]
 RUN_COLUMNS = "class_name:str algorithm:str run:int64 "  # columns of `RUN`, for `frame`
@@ -354,10 +358,24 @@ def _of_cell(result: CellResult) -> dict[str, Any]:
 
 def _final_return(result: CellResult) -> float:
     """Mean return over the last window of evaluations, in % of T; NaN without evaluations."""
-    returns = result.curve.episode_return
-    if not returns:
+    curve, spec = result.curve, result.cell.spec
+    if not curve.steps:
         return math.nan
-    return 100.0 * float(np.mean(returns[-window(len(returns)) :])) / result.cell.spec.horizon
+    returns = share_of_optimum(spec, curve.episode_return, curve.regret, curve.length)
+    return float(np.mean(returns[-window(len(returns)) :]))
+
+
+def share_of_optimum(
+    document: SMESpec | StreamSpec,
+    episode_return: npt.ArrayLike,
+    regret: npt.ArrayLike,
+    length: npt.ArrayLike,
+) -> Array:
+    """Returns in % of T, the optimum's; of step rewards alone where more than they is paid."""
+    returns = np.asarray(episode_return, dtype=np.float64)
+    if any(spec.shaping or spec.compensated or spec.noise for spec in document.specs):
+        returns = (1.0 - np.asarray(regret)) * np.asarray(length)
+    return 100.0 * returns / document.horizon
 
 
 class StreamFrames(NamedTuple):

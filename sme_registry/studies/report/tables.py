@@ -53,7 +53,7 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
+from sme_registry.spec import StreamClass, StudyAlgorithm, StudyFile, StudyPlan, SuiteClass
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.ledger import label
 from sme_registry.studies.report.analysis import (
@@ -91,6 +91,7 @@ from sme_registry.studies.report.frames import (
     frame,
     place,
     runs_of,
+    share_of_optimum,
     stream_frames,
     study_frames,
     window,
@@ -254,15 +255,21 @@ def _learning_curves(analysis: Analysis, part: RunKind) -> pd.DataFrame:
     """Median and quartiles over runs, then the running median over a window of evaluations."""
     columns = f"{PLACE_COLUMNS} measure:str step:int64 median q25 q75 runs:int64 window:int64"
     tables = [frame([], columns)]
-    horizons = part.runs.groupby("class_name").horizon.first()
+    classes: Iterable[SuiteClass | StreamClass] = (
+        analysis.file.plan.streams if part.streams else analysis.file.plan.classes
+    )
+    documents = {member.name: member.instances[0] for member in classes}
     for (name, algorithm), group in by_place(analysis.tables[f"{part.prefix}curves"]).items():
         runs = [run for _, run in group.groupby("run")]
         P = min(map(len, runs))
         width = 1 if part.streams else window(P)
         for measure in CURVES:
-            values = np.array([run[measure][:P] for run in runs])
+            values, regret, length = (
+                np.array([run[column][:P] for run in runs])
+                for column in (measure, "regret", "length")
+            )
             if measure == "episode_return":
-                values *= 100.0 / horizons[name]
+                values = share_of_optimum(documents[name], values, regret, length)
             quartiles = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
             q25, median, q75 = (statistics.running_median(line, width) for line in quartiles)
             steps = np.median([run.step[:P] for run in runs], axis=0).astype(int)

@@ -355,6 +355,9 @@ def compare(
             f"{first!r} and {second!r}: no class has a run of both on the same instance with the "
             "same seed. Run more of the study's cells."
         )
+    absent = [key for key in chosen if key not in {*table.metric}]
+    if absent:
+        raise OptionError(f"metric={absent[0]!r}: has no value in the paired runs. Leave it out.")
     return table
 
 

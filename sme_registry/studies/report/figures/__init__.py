@@ -253,9 +253,7 @@ def draw_decay(analysis: Analysis) -> Drawn:
 
 def draw_maps(analysis: Analysis) -> Drawn:
     inside = analysis.rows("results", region=WITHIN)
-    single = [name for name, info in analysis.classes.items() if info.setting["team"] == "none"]
-    plane = inside[(inside.state_dim == 2) & inside.class_name.isin(single)]
-    kept, problem = _kept_maps(analysis, plane[plane.key.isin(analysis.models)])
+    kept, problem = _kept_maps(analysis, inside[[_on_plane(analysis, key) for key in inside.key]])
     if not kept:
         return
     scale = maps.colour_scale([grid for grid, _ in kept.values()])
@@ -282,6 +280,13 @@ def draw_maps(analysis: Analysis) -> Drawn:
         figure,
         is_map=True,
     )
+
+
+def _on_plane(analysis: Analysis, key: str) -> bool:
+    """Whether a run's model was kept, and is one policy that sees the two state channels."""
+    spec = analysis.cells[key].cell.spec
+    is_plane = spec.state_dim == 2 and spec.team is None and spec.observation is None
+    return is_plane and key in analysis.models
 
 
 def _kept_maps(
