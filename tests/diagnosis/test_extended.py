@@ -9,6 +9,7 @@ from sme_registry import evaluate
 from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_policy
 from sme_registry.diagnosis.measure import POLICY
 from sme_registry.diagnosis.questions import THRESHOLDS
+from sme_registry.errors import OptionError
 from sme_registry.evaluation.references import reference_policy
 from tests.diagnosis.policies import (
     EXTENDED,
@@ -228,6 +229,8 @@ def test_the_capacity_probe_sees_what_the_agent_sees(monkeypatch):
     subject = load_policy(network(), EXTENDED)
     said = []
     found = diagnose(subject, states=64, episodes=8, probe_capacity=True, progress=said.append)
+    with pytest.raises(OptionError, match="'linear' are unknown"):
+        diagnose(load_policy("linear", subject.spec), states=64, episodes=8, probe_capacity=True)
     assert any("capacity" in each for each in said)
     measured = found.measurements
     assert measured.capacity.layers == (EXTENDED.observation_dim, 16, EXTENDED.action_dim)

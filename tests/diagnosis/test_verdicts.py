@@ -423,6 +423,11 @@ def test_the_probe_fits_what_a_network_can_represent_and_fails_at_the_rest(monke
         network = Perceptron((*inner, (*last[:2], "identity")))
         return behaviour.probe_capacity(network, materialize(spec), states, 0, visited)
 
+    activations = {"sigmoid": "Sigmoid", "silu": "SiLU", "elu": "ELU", "identity": "Identity"}
+    for name, module in activations.items():
+        network = Perceptron([(np.zeros((2, 2)), np.zeros(2), name)] * 2)
+        names = [type(layer).__name__ for layer in behaviour._module(network)]
+        assert names == ["Linear", module] * 2
     monkeypatch.setattr(behaviour, "GRADIENT_STEPS", 300)
     monkeypatch.setattr(behaviour, "_MIN_STATES", 16)
     torch.manual_seed(5)

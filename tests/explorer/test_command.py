@@ -123,6 +123,12 @@ def test_the_regret_over_the_episode_is_that_of_rollouts():
     starts = draw.uniform(0, "explorer/starts", 16 * 3).reshape(16, 3)
     runs = rollouts(subject.policy, materialize(SPEC), starts)
     assert sum(over_time["mean"]) / SPEC.horizon == pytest.approx(runs.regret.mean(), abs=1e-5)
+    team = SMESpec(team={"agents": [{"action_dim": 3}, {"action_dim": 1}], "reward": "team"})
+    members = load_policy("constant", team)
+    over_time = facts(members, episodes=16)["episode"]
+    starts = draw.uniform(0, "explorer/starts", 16 * 8).reshape(16, 8)
+    runs = rollouts(members.policy, materialize(team), starts)
+    assert sum(over_time["mean"]) / team.horizon == pytest.approx(runs.regret.mean(), abs=1e-5)
     ended = load("Survival50", SMESpec)
     short = facts(load_policy(fitted(ended), ended), episodes=16)["episode"]
     assert short["running"][0] == 1.0

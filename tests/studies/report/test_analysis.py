@@ -70,6 +70,11 @@ def infos_of(*settings):
     return [(info.axis, info.label) for info in class_infos(plan).values()]
 
 
+def test_the_levels_of_shaping_are_an_axis_of_numbers():
+    levels = infos_of({}, *({"shaping": {"scale": c}, "complexity": 1} for c in (30, 3)))
+    assert levels == [("", ""), ("shaping.scale", "c = 30"), ("shaping.scale", "c = 3")]
+
+
 def test_limits_and_observations_are_axes():
     safe = {"safety": {"tightness": 0.2}}
     assert infos_of({}, safe, safe | {"complexity": 10}) == [

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sme_registry import studies
+from sme_registry import SMESpec, studies
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.statistics import iqm
 from sme_registry.studies.ledger import Ledger
@@ -130,6 +130,17 @@ def test_bad_names_are_refused(loaded, finished):
         studies.compare(loaded, "Alpha", "Beta", ["wd_regrt"])
     with pytest.raises(OptionError, match="given twice"):
         studies.compare(finished, "Alpha", "Alpha")
+    unknown = StudyFrames(loaded.results.assign(online_regret=np.nan), loaded.curves)
+    with pytest.raises(OptionError, match="'online_regret': has no value in the paired runs"):
+        studies.compare(unknown, "Alpha", "Beta", ["wd_regret", "online_regret"])
+
+
+def test_a_share_of_the_optimums_return_is_of_step_rewards_where_more_is_paid():
+    plain = frames.share_of_optimum(SMESpec(horizon=50), [40.0], [0.1], [50.0])
+    assert plain == pytest.approx([80.0])
+    for block in ({"shaping": {"scale": 3.0}}, {"noise": {"reward": 1.0}}):
+        shaped = frames.share_of_optimum(SMESpec(horizon=50, **block), [40.0], [0.1], [25.0])
+        assert shaped == pytest.approx([45.0])
 
 
 def test_a_metric_given_twice_is_compared_once(loaded):

@@ -4,6 +4,7 @@ import csv
 import re
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -23,6 +24,8 @@ pytest.importorskip("matplotlib")
 
 from matplotlib.figure import Figure
 
+from sme_registry import SMESpec
+from sme_registry.studies.report.figures import _on_plane
 from sme_registry.studies.report.write import write_report
 
 FIGURES = {
@@ -176,6 +179,17 @@ def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     assert "figure-maps" not in write_report(tmp_path, formats=["html"])[0].read_text()
     with pytest.raises(OptionError, match="no model of a run on a single task that can be shown"):
         write_report(tmp_path, explorers=True)
+
+
+def test_no_map_shows_a_policy_that_sees_a_mixed_state():
+    def on_plane(spec):
+        cells = {"key": SimpleNamespace(cell=SimpleNamespace(spec=spec))}
+        return _on_plane(SimpleNamespace(cells=cells, models={"key"}), "key")
+
+    plane = SMESpec(state_dim=2, action_dim=2)
+    assert on_plane(plane)
+    assert not on_plane(plane.derive(observation={"mixing": "orthogonal"}))
+    assert not on_plane(SMESpec())
 
 
 def test_other_formats_and_folders_without_a_study_or_results_are_refused(finished, tmp_path):
