@@ -79,8 +79,7 @@ def task_table(spec: SMESpec) -> Table:
         default = defaults.get(name)
         if value != default:
             cells = [f"[bold]{cell}[/]" for cell in cells]
-            shown = "none" if default is None else _exact(default)
-            cells[-1] += f"\ndefault {escape(str(shown))}"
+            cells[-1] += f"\ndefault {escape(str(_exact(default)))}"
         table.add_row(*cells, escape(_SYMBOL.sub("", _description(name))))
     return table
 
@@ -169,9 +168,10 @@ def field_values(setting: Setting) -> dict[str, Any]:
 
 
 def changed_fields(setting: Setting, default: Setting | None = None) -> dict[str, Any]:
-    """What differs from another setting; None for what only the other has."""
+    """What differs from another setting; None for the fields of a block that only the other has."""
     mine, others = field_values(setting), field_values(default or SMESpec())
-    return {k: mine.get(k) for k in {**mine, **others} if mine.get(k) != others.get(k)}
+    names = [*mine, *(name for name in others if name not in mine and "." in name)]
+    return {name: mine.get(name) for name in names if mine.get(name) != others.get(name)}
 
 
 def observation_text(document: SMESpec | StreamSpec) -> str:
@@ -187,7 +187,7 @@ def observation_text(document: SMESpec | StreamSpec) -> str:
 def _exact(value: Any) -> Any:
     """A number without a needless `.0`, and with all its digits: tasks differ in the last."""
     if not isinstance(value, float):
-        return value
+        return "none" if value is None else value
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 

@@ -22,7 +22,7 @@ from sme_registry.errors import (
     StreamError,
     UnknownNameError,
 )
-from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.spec import SMESpec, StreamSpec, cards
 from sme_registry.spec.sme_spec import NEVER
 from sme_registry.task import materialize
 from sme_registry.task.loading import materialize_segments
@@ -223,3 +223,9 @@ def test_segments_of_equal_specs_share_a_task_and_all_must_fit_in_memory_togethe
     assert len(materialize_segments(stream(phase(1, complexity=3)))) == 1
     with pytest.raises(ResourceLimitError, match="40 different tasks together"):
         materialize_segments(stream(*(phase(1, seed=seed, complexity=3) for seed in range(40))))
+
+
+def test_a_phase_without_a_block_of_the_one_before_says_what_it_dropped():
+    shaped = SMESpec(shaping={"scale": 3.0})
+    assert cards.changed_fields(shaped) == {"shaping.scale": 3.0}
+    assert cards.in_words(cards.changed_fields(SMESpec(), shaped)) == "shaping.scale=none"
