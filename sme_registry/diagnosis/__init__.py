@@ -47,7 +47,8 @@ def diagnose(
 
     `against` is another run of a single agent, such as with a single axis changed, measured in the
     same way. `probe_capacity` fits a network of the same layers to a*, in tens of seconds. `states`
-    are uniform, in [64, 1,000,000], and `episodes` in [8, 10,000]; fewer if a state is large.
+    are uniform, in [64, 1,000,000], and `episodes` in [8, 10,000], of a life none; fewer if a state
+    is large.
 
     Examples:
       >>> from sme_registry.diagnosis import diagnose, load_policy

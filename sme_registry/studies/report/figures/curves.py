@@ -281,9 +281,9 @@ def _axis_groups(analysis: Analysis) -> Sequence[Group]:
 
 
 def _class_labels(group: Group, *, with_symbol: bool = False) -> list[str]:
-    """The value of the axis in each class, `25` or `k = 25`; the class's name without an axis."""
+    """The value of the axis in each class, `25` or `k = 25`; its name where that does not tell."""
     labels = [setting_label(group.axis, v, with_symbol=with_symbol) for v in group.values]
-    return labels or list(group.classes)
+    return labels if len({*labels}) == len(group.classes) else list(group.classes)
 
 
 def draw_dynamic_regret(analysis: Analysis) -> Drawn:
