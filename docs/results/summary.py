@@ -110,9 +110,12 @@ def profiles() -> Iterator[pd.DataFrame]:
     clones = pd.read_csv(RESULTS / "ablations-in-jax" / "clones.csv")
     fits = by_run(clones, "wd_regret", ["algorithm", "states_of"])
     clones["algorithm"] = "clone, " + clones["algorithm"]
-    table = pd.concat([pd.DataFrame(runs), clones[clones["states_of"] == "uniform"]])
+    early = rows("ablations-in-jax", "foresight3.csv")
+    early = early.rename(columns={"normalised_regret_0": "wd_regret"})
+    table = pd.concat([pd.DataFrame(runs), early, clones[clones["states_of"] == "uniform"]])
     yield paired(table, "wd_regret", "TD3", "PPO")
-    yield costs(table[table["algorithm"].isin(["PPO", "PPO (gamma 0)"])], "wd_regret")
+    of_profile = table[table["algorithm"].isin(["PPO", "PPO (gamma 0)"])]
+    yield costs(of_profile[of_profile["class_name"] != "Foresight3"], "wd_regret")
     for one, other in (("SAC", "PPO"), *((f"{name} (gamma 0)", name) for name in ALGORITHMS)):
         pairs = paired(table, "wd_regret", one, other)
         yield pairs[["difference", "low", "high", "pairs", "lower"]].dropna().add_prefix(f"{one}: ")
