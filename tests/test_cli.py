@@ -765,6 +765,9 @@ class TestDemo:
         again = sme("demo", "--out", "demo")
         assert again.exit_code == 2
         assert "demo: contains a finished run" in again.stderr
+        (tmp_path / "demo" / "leaderboard").mkdir()  # `make demo` puts its board here
+        good("demo", "--steps", "200", "--out", "demo", "--force")
+        assert (tmp_path / "demo" / "leaderboard").is_dir()
 
 
 @pytest.mark.parametrize("arguments", [("show", "TeamBlind4"), ("show", "Défaut")])

@@ -94,6 +94,7 @@ _FILES = (
     RECORD, EPISODES, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, EVALUATION, STREAM, *plot_files.FILES,
     REPORT, EXPLORER, TENSORBOARD,
 )  # fmt: skip
+_BOARD = "leaderboard"  # the folder of `sme-leaderboard demo`, which replaces it itself
 
 _LOCK = ".lock"  # held by the process that trains; the file stays
 MAX_STEPS = 10**10
@@ -249,7 +250,7 @@ def train(
             learner = entry.learner(run)  # rejects hyperparameters before the folder is created
         record = record.updated(hyperparameters=learner.hyperparameters)
         if record.sessions == 1:
-            claim_folder(folder, _FILES if force else (), force=force)
+            claim_folder(folder, (*_FILES, _BOARD) if force else (), force=force)
         with _lock(folder):
             if record.sessions == 1:
                 _remove_run(folder)
